@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 file = sys.argv[1] if len(sys.argv) > 1 else "runs/arm.mcap"
 nearl = [sys.executable, "-m", "nearl"]
 name = f"example{os.getpid()}"
+os.makedirs(os.path.dirname(file) or ".", exist_ok=True)
 plant = subprocess.Popen([*nearl, "plant", "Panda-reach", "--name", name, "--lockstep", "--seconds", "5"], stdout=subprocess.DEVNULL)
 try:
     run = ["run", "examples/snapshots/panda-reach.safetensors", "--plant", name, "--seconds", "0.5", "--log", file]

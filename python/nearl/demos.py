@@ -45,11 +45,14 @@ from nearl.sources import (
     check_entries,
     csv_table,
     feature_names,
+    hdf5_column,
+    hdf5_parts,
     lerobot_column,
     lerobot_rows,
     minari_dataset,
     npz_arrays,
     once,
+    regular,
     renamed,
     seconds_between,
     split,
@@ -262,26 +265,29 @@ def from_robomimic(
     check_entries(pairs, source)
     columns = {**{unbraced(name): of for name, of in columns.items()}, **pairs}
     acted = actions if isinstance(actions, str) else [of if isinstance(of, str) else f"actions[{i}]" for i, of in enumerate(actions)]
-    os.stat(file)  # a file that is not there is said by the system
+    regular(file, "the HDF5 file that robomimic wrote")
     episodes = []
     try:
         data = h5py.File(file)
     except OSError as error:
         raise BadDemonstrations(f"{source} cannot be read as HDF5 ({error}); give the file that robomimic wrote") from None
     with data:
-        if not isinstance(data.get("data"), h5py.Group):
+        demos = hdf5_parts(data, source).get("data")
+        if not isinstance(demos, h5py.Group):
             raise BadDemonstrations(f"{source}: no group 'data', in which robomimic has its demonstrations; it has {', '.join(data) or 'nothing'}")
-        if odd := [name for name in data["data"] if not name.rpartition("_")[2].isdecimal()]:
+        if odd := [name for name in demos if not name.rpartition("_")[2].isdecimal()]:
             raise BadDemonstrations(f"{source}: 'data/{odd[0]}' has not the name of a demonstration, demo_0 and on; give the file that robomimic wrote")
-        for i, demo in enumerate(sorted(data["data"], key=lambda name: int(name.rpartition("_")[2]))):
-            where, group = f"{source}, episode {i} ({demo})", data["data"][demo]
-            arrays = {**group, **group.get("obs", {})}
+        parts = hdf5_parts(demos, source)
+        for i, demo in enumerate(sorted(parts, key=lambda name: int(name.rpartition("_")[2]))):
+            where = f"{source}, episode {i} ({demo})"
+            arrays = hdf5_parts(parts[demo], where)
+            arrays |= hdf5_parts(arrays["obs"], where) if "obs" in arrays else {}
             for name, (key, k) in columns.items():
                 shape: tuple[int, ...] = getattr(arrays.get(key), "shape", ())
                 if len(shape) != 2 or k >= shape[1]:
                     has = ", ".join(f"{name} {of.shape}" for name, of in arrays.items() if hasattr(of, "shape")) or "nothing"
                     raise BadDemonstrations(f"{where}: no observation '{key}' with entry {k} for '{name}'; it has {has}")
-            episodes.append({name: numbers(arrays[key][:, k], f"'{key}'", where) for name, (key, k) in columns.items()})
+            episodes.append({name: hdf5_column(arrays[key], k, f"'{key}'", where) for name, (key, k) in columns.items()})
     return from_columns(task, episodes, out, dt=dt, actions=acted, period=period, overwrite=overwrite, source=source)
 
 
@@ -317,10 +323,11 @@ def from_lerobot(
             f"{source} is no LeRobot dataset, which is a folder with meta/info.json and data/*/*.parquet; give that folder, and a single parquet file by "
             f"nearl.demos.from_columns: [table for _, table in pandas.read_parquet(file).groupby('episode_index')], with columns called as the task's"
         )
+    regular(meta, "the dataset's folder")
     try:
         info = json.loads(meta.read_text())
         features, dt = info["features"], seconds_between(info["fps"], f"'{meta}'")
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+    except (KeyError, TypeError, json.JSONDecodeError, UnicodeDecodeError, RecursionError, MemoryError) as error:
         raise BadDemonstrations(f"'{meta}' describes no LeRobot dataset of version 3 ({error!r}); give the dataset's folder") from None
     if key not in features:
         raise BadDemonstrations(f"{source}: no feature '{key}'; it has {', '.join(features)}")

@@ -10,6 +10,7 @@ Live objects are read, never files of theirs: the library that wrote a file load
 """
 
 import contextlib
+import inspect
 import itertools
 import math
 import os
@@ -47,10 +48,14 @@ _NORMALISES = re.compile(
 )
 # What of a module has no part in the action that its actor puts out: what judges, and what explores.
 _APART = re.compile(r"critic|value|return|reward|advantage|cost|(^|_)q\d*(_|$)|target|std|sigma|alpha|temperature|entropy|dist|discrim|memory_c", re.IGNORECASE)
+# What computes an action is called so.
+_ACTS = re.compile(r"^(act|predict|infer|inference|sample|policy)$|^(act|predict)_|^(get|select|choose|sample|compute)_actions?(?!s?_log)|(^|_)actions?$")
 # Observations on which a module is held against what was read of it: so many of each size, in standard deviations.
 _ROWS, _SIZES = 8, (1.0, 0.1, 10.0, 100.0)
-# Part of the largest output by which the two may differ, and how much they may in any case: sums in single precision.
-_SAME_PART, _SAME_REST = 1e-4, 1e-6
+# Part by which the two may differ of the largest output of observations of one size, and of all: sums in single precision.
+_SAME_PART, _SAME_REST = 1e-4, 1e-7
+# How many roundings of one number an output of several layers may be off.
+_ROUNDINGS = 12
 # Modules that do nothing when a policy acts.
 _NOTHING = ("Identity", "Flatten", "Dropout", "FlattenExtractor")
 
@@ -141,7 +146,8 @@ def import_torch(
     # Who gives a normaliser or a clip may mean one that stands around the module, or the one in it.
     normalisers = [moments, _moments(None, None, n_in)] if mean is not None or std is not None else [moments]
     clips, ranges = dict.fromkeys((bounds[0], math.inf)), (bounds[1], (-math.inf, math.inf))
-    _check_run(module, moments, [_policy(layers, m, s, c, o) for m, s in normalisers for c in clips for o in ranges])
+    parts = [network[0][1], *(_normalisers(module).values() if network[0][0] and mean is None and std is None else ())]
+    _check_run(module, moments, [_policy(layers, m, s, c, o) for m, s in normalisers for c in clips for o in ranges], _rounding(parts))
     return _place(_policy(layers, *moments, *bounds), robot, recipe, task, name, actions)
 
 
@@ -454,7 +460,7 @@ def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
     """Mean and standard deviation of what normalises observations beside an actor; what is not read exactly is refused, unless they are given."""
     if mean is not None or std is not None:
         return mean, std
-    found = {name: of for name, of in _beside(module).items() if _is_normaliser(name, of)}
+    found = _normalisers(module)
     if not found:
         return None, None
     name, normaliser = next(iter(found.items()))
@@ -476,12 +482,17 @@ def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
     if forward is not None and np.isfinite(mean).all() and np.all(std > 0):
         try:
             seen, given, _ = _ran(normaliser, forward, _observations(mean, std), mean.shape)
-            is_read = _same(given, (seen - mean) / std, max(_SAME_PART, _rounding(normaliser)))
+            is_read = _apart(given, (seen - mean) / std, max(_SAME_PART, _rounding([normaliser]))) is None
         except Exception:  # whatever the code of somebody else raises
             is_read = False
         if not is_read:
             raise ValueError(f"{said}, which computes something else than (observation - mean) / (std + eps) and is not read; {ways}")
     return mean, std
+
+
+def _normalisers(module: Any) -> dict[str, Any]:
+    """What normalises observations beside an actor, by name."""
+    return {name: of for name, of in _beside(module).items() if _is_normaliser(name, of)}
 
 
 def _is_normaliser(name: str, of: Any) -> bool:
@@ -501,18 +512,21 @@ def _of_batches(name: str, norm: Any) -> tuple[np.ndarray, np.ndarray]:
     return mean - bias * std / weight, std / weight
 
 
-def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequence[Policy]) -> None:
+def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequence[Policy], rounding: float) -> None:
     """Holds what a module itself gives against what was ``read`` of it, of which the first is imported and the others lack what may stand around the module.
-    One that cannot be run may have nothing beside its actor that nobody knows."""
+    One that has nothing to run may have nothing beside its actor that nobody knows. `rounding` is the part that the precision of what was read loses."""
     has_actor = hasattr(module, "actor")
     kind, of = type(module).__name__, "module.actor" if has_actor else "its layers"
     around = "give nearl.import_torch(module.actor), with mean=, std=, clip= and output_clip= for what stands around it"
     give = f"where the actor is all of the policy, {around}; else {_EXPORT}" if has_actor else _EXPORT
+    part = max(_SAME_PART, rounding)
     for way, function in _ways(module):
+        if way == "forward" and _lacks_forward(module):
+            continue
         try:
             seen, given, again = _ran(module, function, _observations(*moments), (read[0].n_out,))
-        except NotImplementedError:
-            continue
+        except _Unreadable as error:
+            raise ValueError(f"module {kind} gives what nobody can hold {of} against: its {way} gives {error}; {give}") from None
         except Exception as error:
             said = " ".join(str(error).split()) or "no reason given"
             raise ValueError(
@@ -522,15 +536,15 @@ def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequen
         if not np.array_equal(given, again, equal_nan=True):
             why = f"{way}: it draws, or remembers"
             raise ValueError(f"module {kind} gives two outputs for the same observation ({why}), so nobody can hold {of} against it; {give}")
-        part = max(_SAME_PART, _rounding(module))
         wanted = None
         for policy in read:
             found = np.stack([policy(obs) for obs in seen])
             wanted = found if wanted is None else wanted
-            if _same(given, found, part):
+            if _apart(given, found, part) is None:
                 return
         assert wanted is not None
-        row = next(rows for rows in _groups(len(given)) if not _same(given[rows], wanted[rows], part))
+        row = _apart(given, wanted, part)
+        assert row is not None
         off = np.abs(given[row] - wanted[row])
         i, k = np.unravel_index(np.argmax(np.where(np.isnan(off), np.inf, off)), off.shape)
         raise ValueError(
@@ -542,7 +556,14 @@ def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequen
 
 
 def _check_apart(module: Any, give: str) -> None:
-    """Refuses parts and tensors beside an actor that may have a part in the action, where the module cannot be asked."""
+    """Refuses parts, tensors and functions beside an actor that may have a part in the action, where the module cannot be asked."""
+    functions = {name: getattr(type(module), name, None) for name in dir(type(module))} | getattr(module, "__dict__", {})
+    if acts := sorted(name for name, of in functions.items() if inspect.isroutine(of) and _ACTS.search(name)):
+        said = f"its own {', '.join(acts)} {'is' if len(acts) == 1 else 'are'} not read"
+        raise ValueError(
+            f"module {type(module).__name__} has neither forward nor act_inference, and {said}, so nobody knows whether the action is what module.actor gives; "
+            f"{give}"
+        )
     for name, of in _beside(module).items():
         is_part = any(hasattr(of, what) for what in ("named_children", "forward", "detach")) or isinstance(of, np.ndarray)
         if is_part and not _APART.search(name) and not _is_normaliser(name, of):
@@ -559,6 +580,12 @@ def _ways(module: Any) -> list[tuple[str, Callable[[Any], Any]]]:
     return [(way, function) for way, function in ways if callable(function)]
 
 
+def _lacks_forward(module: Any) -> bool:
+    """Whether a module of torch has none of its own; one that has one and raises in it is not without."""
+    torch = sys.modules.get("torch")
+    return torch is not None and getattr(module.forward, "__func__", None) is torch.nn.Module.forward
+
+
 def _observations(mean: np.ndarray, std: np.ndarray) -> np.ndarray:
     """Seeded ones in single precision, of each size some."""
     z = np.random.default_rng(0).normal(size=(len(_SIZES), _ROWS, len(mean)))
@@ -570,14 +597,17 @@ def _groups(n: int) -> list[slice]:
     return [slice(at, at + _ROWS) for at in range(0, n, _ROWS)]
 
 
-def _same(a: np.ndarray, b: np.ndarray, part: float) -> bool:
-    """Whether two outputs are the same but for rounding, in each group."""
-    return all(bool(np.all(np.abs(a[rows] - b[rows]) <= part * np.abs(b[rows]).max() + _SAME_REST)) for rows in _groups(len(a)))
+def _apart(a: np.ndarray, b: np.ndarray, part: float) -> slice | None:
+    """The first group in which two outputs differ by more than rounding; None where they are the same."""
+    size = np.abs(b)
+    return next((rows for rows in _groups(len(a)) if not np.all(np.abs(a[rows] - b[rows]) <= part * size[rows].max() + _SAME_REST * size.max())), None)
 
 
-def _rounding(module: Any) -> float:
-    """Part of the outputs that a module in half precision loses; 0 in any other."""
-    return max((100.0 * 2.0**-10 if of.element_size() == 2 else 0.0 for of in getattr(module, "parameters", list)()), default=0.0)
+def _rounding(read: Iterable[Any]) -> float:
+    """Part of the outputs that is lost by the precision of what was read; 0 where it is none of torch."""
+    torch = sys.modules.get("torch")
+    tensors = [of for part in read for table in ("parameters", "buffers") for of in getattr(part, table, list)()] if torch is not None else []
+    return max((_ROUNDINGS * float(torch.finfo(of.dtype).eps) for of in tensors if of.is_floating_point()), default=0.0)  # type: ignore[union-attr]
 
 
 def _ran(module: Any, function: Callable[[Any], Any], obs: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -595,13 +625,25 @@ def _ran(module: Any, function: Callable[[Any], Any], obs: np.ndarray, shape: tu
         return _numbers(tensor(obs), "the observation"), given[0], given[1]
 
 
+class _Unreadable(ValueError):
+    """What a module gave, in which nobody finds the action."""
+
+
 def _output(given: Any) -> np.ndarray:
-    """The action in what a module gives: the first of several things, the mean of a distribution."""
-    if isinstance(given, tuple | list):
-        given = given[0]
-    if not hasattr(given, "shape") and not callable(getattr(given, "mean", print)):
-        given = given.mean
-    return _numbers(given, "its output")
+    """The action in what a module gives: the first of several things, the mean of a distribution.
+
+    Raises:
+        _Unreadable: there is none, as in a distribution that has no mean, whose code may add anything to what it is made of.
+    """
+    try:
+        if isinstance(given, tuple | list):
+            given = given[0]
+        if not hasattr(given, "shape") and not callable(getattr(given, "mean", print)):
+            given = given.mean
+        return _numbers(given, "its output")
+    except Exception as error:  # whatever the code of somebody else raises
+        said = " ".join(str(error).split())[:200] or "no reason given"
+        raise _Unreadable(f"a {type(given).__name__}, of which the action cannot be read ({type(error).__name__}: {said})") from None
 
 
 @contextlib.contextmanager
@@ -615,7 +657,9 @@ def _acting(module: Any) -> Iterator[Callable[[np.ndarray], Any]]:
         return
     parts = [(part, dict(vars(part)), dict(part._buffers)) for part in dict.fromkeys(part for of in modules for part in of.modules())]
     tensors = [(of, of.detach().clone()) for part, _, _ in parts for of in (*part._parameters.values(), *part._buffers.values()) if of is not None]
-    like = next((of for of, _ in tensors if of.is_floating_point()), torch.zeros(1))
+    actor = getattr(module, "actor", None)
+    of_actor = list(actor.parameters()) if isinstance(actor, torch.nn.Module) else []  # what is beside it may have another precision
+    like = next((of for of in (*of_actor, *(of for of, _ in tensors)) if of.is_floating_point()), torch.zeros(1))
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         try:
             for part, _, _ in parts:
@@ -659,7 +703,7 @@ def _live(model: Any, name: str, loader: str) -> None:
 
 def _is_torchscript(file: _Path) -> bool:
     """By the names in the archive; nothing of it is unpickled."""
-    if not zipfile.is_zipfile(file):
+    if not os.path.isfile(file) or not zipfile.is_zipfile(file):
         return False
     with zipfile.ZipFile(file) as archive:
         return any("/code/" in name for name in archive.namelist())

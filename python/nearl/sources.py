@@ -3,6 +3,7 @@
 import csv
 import os
 import re
+import stat
 import zipfile
 from array import array
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,6 +19,8 @@ from nearl.recorded import BadDemonstrations, numbers
 
 Floats = NDArray[np.float64]
 FilePath = str | os.PathLike[str]
+# Largest file of demonstrations that is read, and what is unpacked of one [bytes].
+LARGEST = 4 << 30
 # How files begin that are often taken for CSV.
 _NO_TEXT = {
     b"PK": "a zip or .npz file, no CSV; give the text file",
@@ -26,6 +29,19 @@ _NO_TEXT = {
     b"\xff\xfe": "text in UTF-16; save it as UTF-8",
     b"\xfe\xff": "text in UTF-16; save it as UTF-8",
 }
+
+
+def regular(file: FilePath, give: str) -> None:
+    """Refuses what is no regular file of at most `LARGEST` bytes, before it is opened: a pipe waits, and a device may be without end."""
+    try:
+        found = os.stat(file)
+    except OSError as error:
+        raise unread(error, file) from error
+    if not stat.S_ISREG(found.st_mode):
+        what = "is a folder, not a regular file" if stat.S_ISDIR(found.st_mode) else "is not a regular file"
+        raise BadDemonstrations(f"'{os.fspath(file)}' {what}; give {give}")
+    if found.st_size > LARGEST:
+        raise BadDemonstrations(f"'{os.fspath(file)}' has {found.st_size} bytes, more than the limit of {LARGEST}; split it, and convert each part")
 
 
 def once(names: Iterable[str], source: str) -> None:
@@ -86,6 +102,7 @@ def renamed(table: Mapping[str, Floats], columns: Any, source: str) -> dict[str,
 def csv_table(file: FilePath) -> dict[str, Floats]:
     """Columns (n) of a CSV file by the names of its heading."""
     source = f"'{os.fspath(file)}'"
+    regular(file, "a CSV file")
     try:
         with open(file, "rb") as data:
             begin = data.read(4)
@@ -107,6 +124,8 @@ def csv_table(file: FilePath) -> dict[str, Floats]:
             raise BadDemonstrations(f"{source} is no text in UTF-8 ({error.reason}, after line {lines.line_num}); save it as UTF-8") from None
         except csv.Error as error:
             raise BadDemonstrations(f"{source}, line {lines.line_num}: {error}; write a heading, then numbers between commas") from None
+        except MemoryError:
+            raise BadDemonstrations(f"{source}, line {lines.line_num}: its numbers do not fit into memory; split it, and convert each part") from None
     if not values:
         raise BadDemonstrations(f"{source}: a heading and no row below it; give one row for each time step")
     return dict(zip(heading, np.frombuffer(values).reshape(-1, len(heading)).T))
@@ -149,22 +168,32 @@ def _number(cell: str) -> float | None:
 def npz_arrays(file: FilePath, needed: Sequence[str], other: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The arrays ``needed`` of an ``.npz`` file, and of the ``other`` ones those that it has."""
     source = f"'{os.fspath(file)}'"
+    regular(file, "an .npz file")
     try:
-        os.stat(file)
-    except OSError as error:
-        raise unread(error, file) from error
-    if not zipfile.is_zipfile(file):
+        data = np.load(file, allow_pickle=False) if zipfile.is_zipfile(file) else None
+    except Exception as error:  # whatever zipfile says of a damaged one
+        raise BadDemonstrations(f"{source} cannot be read as .npz ({error or type(error).__name__}); write it with numpy.savez") from None
+    if not isinstance(data, np.lib.npyio.NpzFile):
         raise BadDemonstrations(f"{source} is no .npz file, or was cut short; write it with numpy.savez")
-    with np.load(file, allow_pickle=False) as data:
+    with data:
         missing = [name for name in needed if name not in data.files]
         if missing:
             raise BadDemonstrations(f"{source}: no array '{missing[0]}'; it has {', '.join(data.files)}")
+        wanted = [*needed, *(name for name in other if name in data.files)]
+        entries = data.zip.infolist() if data.zip is not None else []
+        unpacked = sum([int(of.file_size) for of in entries if of.filename.removesuffix(".npy") in wanted])
+        if unpacked > LARGEST:
+            raise BadDemonstrations(f"{source}: {', '.join(wanted)} have {unpacked} bytes, more than the limit of {LARGEST}; split it, and convert each part")
         arrays = {}
-        for name in (*needed, *(name for name in other if name in data.files)):
+        for name in wanted:
             try:
-                arrays[name] = data[name]
-            except (ValueError, OSError, zipfile.BadZipFile) as error:
-                raise BadDemonstrations(f"{source}: array '{name}' cannot be read ({error}); write numbers or text, no objects, with numpy.savez") from None
+                array = data[name]
+            except Exception as error:  # of NumPy, zipfile and zlib, a MemoryError of what the array's head says among them
+                said = " ".join(str(error).split()) or type(error).__name__
+                raise BadDemonstrations(f"{source}: array '{name}' cannot be read ({said}); write numbers or text, no objects, with numpy.savez") from None
+            if not isinstance(array, np.ndarray):  # but bytes, which do not begin as an array does
+                raise BadDemonstrations(f"{source}: '{name}' is no array of NumPy; write it with numpy.savez")
+            arrays[name] = array
     return arrays
 
 
@@ -228,11 +257,16 @@ def _parquet(file: Path, names: Sequence[str]) -> dict[str, list[Any]]:
     import pyarrow
     from pyarrow import parquet
 
+    regular(file, "the folder of a dataset whose parquet files are files")
     try:
         with parquet.ParquetFile(file) as data:
             table = data.read([name for name in names if name in data.schema_arrow.names])
+            if table.nbytes > LARGEST:
+                raise BadDemonstrations(f"'{file}' unpacks to {table.nbytes} bytes, more than the limit of {LARGEST}; split it, and convert each part")
             return {name: table[name].to_pylist() for name in table.column_names}
-    except (pyarrow.ArrowException, OSError) as error:
+    except BadDemonstrations:
+        raise
+    except (pyarrow.ArrowException, OSError, MemoryError) as error:
         said = " ".join(str(error).split()).rstrip(".")
         raise BadDemonstrations(f"'{file}' cannot be read as parquet ({said}); it was cut short or damaged: get the file again") from None
 
@@ -289,12 +323,44 @@ def minari_dataset(name: str) -> Any:
         import minari  # type: ignore[import-not-found]  # an extra
     except ImportError as error:
         raise ImportError(f"reading the Minari dataset '{name}' needs minari: pip install 'nearl[minari]'") from error
+    root = Path(os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets")
+    for file in sorted((root / name / "data").rglob("*")):
+        if not file.is_dir():
+            regular(file, f"what `minari download {name}` writes")
     try:
         return minari.load_dataset(name)
     except FileNotFoundError:
         raise BadDemonstrations(f"Minari dataset '{name}' is not on this machine; get it with `minari download {name}`, or correct the name") from None
     except (OSError, ValueError) as error:
         raise BadDemonstrations(f"Minari dataset '{name}' cannot be read: {error}; correct the name, or give what minari.load_dataset returns") from None
+
+
+def hdf5_parts(group: Any, where: str) -> dict[str, Any]:
+    """What a group of an HDF5 file holds, by name; a link is refused, and a part that is in another file, which may be a pipe or a device."""
+    import h5py
+
+    if not isinstance(group, h5py.Group):
+        raise BadDemonstrations(f"{where}: '{getattr(group, 'name', group)}' is no group; give the file that robomimic wrote")
+    parts = {}
+    for name in group:
+        is_own = isinstance(group.get(name, getlink=True), h5py.HardLink)
+        part = group.get(name) if is_own else None
+        if part is None or (isinstance(part, h5py.Dataset) and (part.external or part.is_virtual)):
+            what = "is in another file" if is_own else "is a link"
+            raise BadDemonstrations(f"{where}: '{name}' {what}, which is not followed; give a file that holds all of its data itself")
+        parts[name] = part
+    return parts
+
+
+def hdf5_column(array: Any, k: int, what: str, where: str) -> Floats:
+    """Column k of a dataset (n x any) of an HDF5 file."""
+    if (size := array.shape[0] * array.dtype.itemsize) > LARGEST:
+        raise BadDemonstrations(f"{where}: {what} has shape {array.shape}, {size} bytes a column, more than the limit of {LARGEST}; split it")
+    try:
+        return numbers(array[:, k], what, where)
+    except (OSError, MemoryError, RuntimeError) as error:
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise BadDemonstrations(f"{where}: {what} cannot be read ({said}); it was cut short or damaged: get the file again") from None
 
 
 def check_entries(columns: Any, source: str) -> None:

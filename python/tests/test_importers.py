@@ -1128,13 +1128,108 @@ def test_a_module_that_does_more_than_its_actor_is_refused(tmp_path) -> None:
     with pytest.raises(ValueError, match=r"cannot be run on observations of 14 entries \(act_inference: KeyError: 'x'\), so nobody knows .*\(module.actor\)"):
         nearl.import_torch(Actor(lambda m, x: {}["x"]), **files)
 
-    def none(_):
-        raise NotImplementedError
-
-    nearl.import_torch(Actor(act_inference=none), **files)
     grouped = Actor(obs_groups={"policy": ["a", "b"]})
     grouped.act_inference = lambda groups: np.stack([grouped.actor(x) for x in np.hstack([groups["a"], groups["b"]])])
     nearl.import_torch(grouped, **files)
+
+
+class Squashed:
+    """A distribution that says of its mean that it is not known, as torch's TransformedDistribution."""
+
+    def __init__(self, of) -> None:
+        self.of = of
+
+    @property
+    def mean(self):
+        raise NotImplementedError
+
+
+def test_what_a_module_does_not_say_is_not_taken_for_its_actor(tmp_path) -> None:
+    """A function that raises is there, an output that cannot be read is none, and an `act` of its own may add anything."""
+    files = planar(tmp_path)
+
+    def none(_):
+        raise NotImplementedError("export me")
+
+    alone = r"where the actor is all of the policy, give nearl.import_torch\(module.actor\)"
+    for parts, said in (
+        ({"act_inference": none}, r"cannot be run on observations of 14 entries \(act_inference: NotImplementedError: export me\), so nobody knows"),
+        ({"forward": none}, r"cannot be run on observations of 14 entries \(forward: NotImplementedError: export me\)"),
+        ({"forward": Squashed}, r"against: its forward gives a Squashed, of which the action cannot be read \(NotImplementedError: no reason given\)"),
+        ({"forward": lambda rows: {"action": rows}}, r"its forward gives a dict, of which the action cannot be read \(ValueError: "),
+        ({"forward": lambda rows: ()}, r"its forward gives a tuple, of which the action cannot be read \(IndexError: "),
+        ({"act_on": none}, "Actor has neither forward nor act_inference, and its own act_on is not read, so nobody knows whether"),
+        ({"predict": none, "get_actions": none}, "its own get_actions, predict are not read, so nobody knows whether the action is what module.actor gives"),
+    ):
+        with pytest.raises(ValueError, match=f"{said}.*{alone}"):
+            nearl.import_torch(Actor(**parts), **files)
+    same = Actor(lambda m, x: m.actor(x), get_action=none)
+    nearl.import_torch(same, **files)  # of which act_inference says what it does
+    nearl.import_torch(Actor(get_actions_log_prob=none, evaluate=none, action_std=np.ones(3)), **files)
+    same.act_inference, inference = (lambda rows: SimpleNamespace(mean=inference(rows))), same.act_inference
+    nearl.import_torch(same, **files)  # a distribution that has one
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-8, 1e-20])
+def test_outputs_are_held_against_each_other_by_their_size(tmp_path, size) -> None:
+    net = Sequential([Linear(14, 9), Tanh(), Linear(9, 3)])
+    net[2].weight, net[2].bias = size * f32(net[2].weight), size * f32(net[2].bias)
+    for factor in (1.0, 2.0, 1.001):
+        module = Actor(lambda m, x, factor=factor: factor * m.actor(x), actor=net)
+        if factor == 1.0:
+            nearl.import_torch(module, **planar(tmp_path))
+            continue
+        with pytest.raises(ValueError, match="module Actor does more than module.actor"):
+            nearl.import_torch(module, **planar(tmp_path))
+
+
+def test_a_distribution_of_torch_and_parts_in_half_precision(tmp_path) -> None:
+    torch = pytest.importorskip("torch")
+    nn, of, files = torch.nn, torch.distributions, planar(tmp_path)
+
+    class Agent(nn.Module):
+        def __init__(self, around, critic=torch.float32, actor=torch.float32) -> None:
+            super().__init__()
+            self.critic = nn.Linear(14, 1).to(critic)
+            self.actor, self.around = nn.Sequential(nn.Linear(14, 9), nn.ELU(), nn.Linear(9, 3)).to(actor), around
+
+        def forward(self, x):
+            return self.around(self.actor(x))
+
+    class Silent(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.actor = nn.Sequential(nn.Linear(14, 3))
+
+    nearl.import_torch(Silent(), **files)
+    Silent.get_action = lambda self, x: torch.tanh(self.actor(x))
+    with pytest.raises(ValueError, match="module Silent has neither forward nor act_inference, and its own get_action is not read"):
+        nearl.import_torch(Silent(), **files)
+    normal = lambda x: of.Normal(x, 0.1)  # noqa: E731
+    squashed = lambda x: of.TransformedDistribution(normal(x), [of.TanhTransform(), of.AffineTransform(0.0, 2.0)])  # noqa: E731
+    for around in (squashed, lambda x: of.Independent(squashed(x), 1)):
+        with pytest.raises(ValueError, match=r"its forward gives a \w+, of which the action cannot be read \(NotImplementedError"):
+            nearl.import_torch(Agent(around), **files)
+    half = {torch.float16: 1.03, torch.bfloat16: 1.2}
+    for around in (lambda x: x, normal):
+        for kind in half:
+            nearl.import_torch(Agent(around, critic=kind), **files)
+            nearl.import_torch(Agent(around, actor=kind), **files)
+    for kind, factor in half.items():
+        for more, kinds in ((1.001, {"critic": kind}), (factor, {"actor": kind})):
+            with pytest.raises(ValueError, match="module Agent does more than module.actor"):
+                nearl.import_torch(Agent(lambda x, more=more: more * x, **kinds), **files)
+    module = Agent(lambda x: 1.001 * x)
+    module.obs_norm = nn.LayerNorm(14).half()  # which is not read where mean is given
+    with pytest.raises(ValueError, match="module Agent does more than module.actor"):
+        nearl.import_torch(module, **files, mean=np.zeros(14))
+
+
+def test_a_pipe_is_no_file_of_torchscript(tmp_path) -> None:
+    """It had been waited for."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match="pipe' is a file, and files of PyTorch .* are pickles"):
+        nearl.import_torch(tmp_path / "pipe", **planar(tmp_path))
 
 
 @pytest.mark.parametrize("hooks", ["_forward_hooks", "_forward_pre_hooks"])

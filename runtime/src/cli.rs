@@ -143,15 +143,26 @@ pub enum LoopBench {
     },
 }
 
-/// Prints a line. A closed pipe ends the program quietly, as other commands do; any other failure ends it with code 1.
+/// Writes a line to standard error, as `eprintln!` does. Where nobody can read it any more, as in a terminal that was closed, it is lost and the program
+/// goes on.
+#[macro_export]
+macro_rules! tell {
+    ($($words:tt)*) => {
+        drop(std::io::Write::write_fmt(&mut std::io::stderr(), format_args!("{}\n", format_args!($($words)*))))
+    };
+}
+
+/// Prints a line. A closed pipe ends the program quietly, as other commands do, and what a closed terminal should show is lost; any other failure ends it with
+/// code 1.
 pub fn say(line: impl std::fmt::Display) {
     use std::io::{ErrorKind, Write};
     let mut out = std::io::stdout().lock();
     match writeln!(out, "{line}").and_then(|()| out.flush()) {
         Ok(()) => {}
         Err(e) if e.kind() == ErrorKind::BrokenPipe => std::process::exit(0),
+        Err(e) if e.raw_os_error() == Some(libc::EIO) => {} // the program was told by SIGHUP
         Err(e) => {
-            eprintln!("standard output cannot be written ({e}): send it to another file");
+            crate::tell!("standard output cannot be written ({e}): send it to another file");
             std::process::exit(1);
         }
     }
@@ -399,7 +410,7 @@ fn wake(rate: f64, seconds: f64, priority: i32, cpu: Option<usize>, json: bool) 
     let settings = ThreadSettings { priority: (priority > 0).then_some(priority), cpu, lock_memory: true };
     let (late, warnings) = bench_wake(1.0 / rate, (rate * seconds) as u64, settings, &Stop::new())?;
     for warning in &warnings {
-        eprintln!("warning: {warning}");
+        crate::tell!("warning: {warning}");
     }
     if json {
         say(serde_json::json!({ "rate_hz": rate, "wake_ns": late, "warnings": warnings }));

@@ -85,6 +85,9 @@ pub struct Demonstrations {
 
 /// Larger files are refused before they are read [bytes].
 const MAX_BYTES: u64 = 4 << 30;
+/// Steps that an episode can have: more than a file holds.
+const LONGEST: f64 = 1e9;
+
 /// No position, speed, force or observation of a robot is larger, in any unit.
 const LARGEST: f64 = 1e9;
 
@@ -118,8 +121,12 @@ impl Demonstrations {
             return Err(format!("'dt' is {dt}; give the policy period in seconds"));
         }
         let lengths = numbers(&mut arrays, "lengths")?.1;
-        if let Some((i, l)) = lengths.iter().enumerate().find(|(_, l)| !(**l >= 1.0 && l.fract() == 0.0)) {
-            return Err(format!("episode {i} has the length {l}; give whole numbers of steps, at least 1"));
+        if let Some((i, l)) =
+            lengths.iter().enumerate().find(|(_, l)| !((1.0..=LONGEST).contains(*l) && l.fract() == 0.0))
+        {
+            return Err(format!(
+                "episode {i} has the length {l}; give whole numbers of steps, 1 to {LONGEST:e}"
+            ));
         }
         let lengths: Vec<usize> = lengths.into_iter().map(|l| l as usize).collect();
         if lengths.is_empty() {

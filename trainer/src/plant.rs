@@ -278,7 +278,7 @@ impl MujocoPlant {
         while let Err(e) = self.env.reset(&mut self.rng) {
             refused += 1;
             assert!(refused < MOST_DRAWS, "{e}");
-            eprintln!("nearl: the start of an episode is drawn again: {e}");
+            nearl_runtime::tell!("nearl: the start of an episode is drawn again: {e}");
         }
         self.meter.begin(self.env.qvel());
         self.is_sent = false;

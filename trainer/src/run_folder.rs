@@ -35,6 +35,14 @@ pub enum RunError {
         /// Folder.
         path: String,
     },
+    /// A file of somebody's is already there.
+    #[error(
+        "'{file}' is there already, and a run in this folder would write its own in its place; give another folder with --out"
+    )]
+    Foreign {
+        /// Path.
+        file: String,
+    },
     /// A run is already there.
     #[error(
         "'{path}' already holds a run; go on with --resume, give another folder with --out, or remove it"
@@ -116,6 +124,24 @@ fn about_run(held: Option<&File>, about: &serde_json::Value) -> std::io::Result<
     let Some(mut file) = held else { return Ok(()) };
     file.set_len(0)?;
     file.write_all(format!("{about:#}\n").as_bytes())
+}
+
+/// A file of the user's, in a folder that no run has begun in, whose place the task or the robot of a run would take.
+fn foreign(path: &Path, manifest: &Manifest) -> Option<PathBuf> {
+    if path.join("metrics.csv").exists() {
+        return None;
+    }
+    let env = path.join("env.json");
+    if std::fs::metadata(&env).is_ok_and(|facts| facts.len() > 0) {
+        return Some(env);
+    }
+    let (task, robot) = task_file(manifest);
+    let files = [Some(("task.toml".into(), task)), robot].into_iter().flatten();
+    let differs = |(file, text): (PathBuf, String)| {
+        let is_other = file.exists() && std::fs::read(&file).map_or(true, |there| there != text.as_bytes());
+        is_other.then_some(file)
+    };
+    files.map(|(name, text): (String, String)| (path.join(name), text)).find_map(differs)
 }
 
 /// Whether something was learned there: a checkpoint, or a row of metrics, of which a run of this program has one before anything is learned.
@@ -202,6 +228,14 @@ impl RunFolder {
         File::options().append(true).create(true).open(&env).map_err(unwritten(&env))?;
         let held = lock(path)?;
         is_free()?;
+        if let Some(file) = foreign(path, manifest) {
+            // What was made here is empty, and nobody else's.
+            if std::fs::metadata(&env).is_ok_and(|facts| facts.len() == 0) {
+                let _ = std::fs::remove_file(&env);
+            }
+            let _ = std::fs::remove_dir(&checkpoints);
+            return Err(RunError::Foreign { file: file.display().to_string() });
+        }
         write_task(path, "task", manifest)?;
         let mut about = serde_json::json!({
             "algo": manifest.algo, "seed": seed, "version": env!("CARGO_PKG_VERSION"),
@@ -234,6 +268,9 @@ impl RunFolder {
     ) -> Result<Self, RunError> {
         let file = path.join("metrics.csv");
         let broken = |reason: String| RunError::Metrics { path: file.display().to_string(), reason };
+        if std::fs::metadata(&file).is_ok_and(|facts| !facts.is_file()) {
+            return Err(broken("it is no regular file".into()));
+        }
         let text = std::fs::read_to_string(&file).map_err(|e| broken(e.to_string()))?;
         let mut lines = text.split_inclusive('\n').filter_map(|l| l.strip_suffix('\n'));
         if lines.next() != Some(columns.join(",").as_str()) {

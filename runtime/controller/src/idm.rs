@@ -1,7 +1,8 @@
 //! Inverse dynamics: from the state and the projected state to the action.
 
 use crate::arrival::{Arrivals, ROUNDS, Within};
-use crate::controller::Parts;
+use crate::controller::{Parts, held_dofs};
+use crate::followers::Followers;
 use crate::motors::Motors;
 use crate::net::Forward;
 use crate::normaliser::CLIP;
@@ -51,6 +52,7 @@ pub struct AnalyticIdm {
     motors: Motors,
     period: Period,
     pub(crate) arrivals: Arrivals,
+    followers: Option<Followers>,
     tau: Vec<f64>,
     external: Vec<f64>,
 }
@@ -63,10 +65,20 @@ impl AnalyticIdm {
     pub fn new(m: &Manifest, model: &Model, dofs: &[usize]) -> Result<Self, SnapshotError> {
         let drives = Parts::drives(m, model, dofs)?;
         let motors = Parts::motors(model, dofs, &drives)?;
-        let others: Vec<usize> = (0..model.nv()).filter(|i| !dofs.contains(i)).collect();
+        let proposed = match m.guards() {
+            true => Vec::new(), // what is proposed are actions
+            false => Parts::proposed_dofs(m, model)?,
+        };
+        // They go where they are proposed, stay where they are held, or follow.
+        let held = held_dofs(model, dofs);
+        let led: Vec<usize> = (0..model.nv())
+            .filter(|i| !dofs.contains(i) && (proposed.contains(i) || held.contains(i)))
+            .collect();
+        let driven: Vec<usize> = (0..model.nv()).filter(|i| dofs.contains(i) || led.contains(i)).collect();
         Ok(Self {
             dynamics: Dynamics::new(model),
-            arrivals: Arrivals::new(m, model, dofs, (&drives, &motors), &others),
+            arrivals: Arrivals::new(m, model, dofs, (&drives, &motors), &led),
+            followers: Followers::new(model, &driven, m.task.period()),
             motors,
             dofs: dofs.to_vec(),
             period: m.task.period(),
@@ -96,6 +108,9 @@ impl AnalyticIdm {
         target: &mut Target,
         action: &mut [f64],
     ) {
+        if let Some(followers) = &mut self.followers {
+            followers.follow((q, v), proposal, projector, target);
+        }
         self.action(q, v, target, projector.limits_of_tick(), action);
         self.arrivals.begin();
         for _ in 0..if projector.needs_what_is_reached() { ROUNDS } else { 0 } {

@@ -7,6 +7,7 @@ pub mod codes;
 pub mod command;
 pub mod controller;
 pub mod file_kind;
+mod followers;
 pub mod idm;
 pub mod motors;
 pub mod net;

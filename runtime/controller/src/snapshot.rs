@@ -316,7 +316,8 @@ pub fn one_line(text: &dyn std::fmt::Display) -> String {
     line
 }
 
-/// Writes a file whole: to a name beside it, then renamed, so that no reader ever sees a part of it. A link stays, and what it leads to is written.
+/// Writes a file whole, in a folder that is made where it is missing: to a name beside it, then renamed, so that no reader ever sees a part of it. A link
+/// stays, and what it leads to is written.
 ///
 /// # Errors
 /// What the system said; devices, pipes and folders, which are not replaced by a file.
@@ -328,6 +329,9 @@ pub fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     }
     let beside = path.with_extension(format!("part{}", std::process::id()));
     let write = || {
+        if let Some(folder) = path.parent() {
+            std::fs::create_dir_all(folder)?;
+        }
         let mut file = std::fs::File::create(&beside)?;
         file.write_all(bytes)?;
         file.sync_all()?;

@@ -289,6 +289,13 @@ impl Task {
             let line = if overrides.is_empty() { line_of_key(text, &path).0 } else { String::new() };
             return Err(odd(file, &line, &path, value));
         }
+        if let Some((key, reason)) = listed(&table) {
+            return Err(TaskError::Invalid {
+                file: file.into(),
+                place: bracket(&key),
+                reason: reason.into(),
+            });
+        }
         let mut task: Task = serde_path_to_error::deserialize(table).map_err(|e| {
             let key = e.path().to_string();
             let below = overrides.iter().find(|set| set.trim_start().starts_with(&format!("{key}.")));
@@ -369,6 +376,9 @@ impl Task {
         let mut table = Self::table(&file, &text)?;
         if let Some((path, value)) = first_odd(&table) {
             return Err(odd(&file, &line_of_key(&text, &path).0, &path, value));
+        }
+        if let Some((key, reason)) = listed(&table) {
+            return Err(at(bracket(&key), reason.into()));
         }
         let Some(section) = table.remove("constraints") else {
             return Err(at(String::new(), "it has no section [constraints]; write one".into()));
@@ -634,6 +644,20 @@ fn of_another_kind(message: &str) -> Option<String> {
         other => other,
     };
     Some(format!("it is {is}; give {wanted}"))
+}
+
+/// A section that is written as a list, whose entries would be taken for its keys in turn, and what to do.
+fn listed(table: &toml::Table) -> Option<(String, &'static str)> {
+    let sections = ["model", "time", "state", "idm", "policy", "command", "constraints"];
+    if let Some(key) = sections.into_iter().find(|key| table.get(*key).is_some_and(toml::Value::is_array)) {
+        return Some((key.into(), "it is a list; give keys and their values, as { key = value }"));
+    }
+    let limits = table.get("constraints")?.as_table()?;
+    let is_plain =
+        |value: &toml::Value| value.as_array().is_some_and(|list| !list.iter().all(toml::Value::is_table));
+    let (key, _) = limits.iter().find(|(_, value)| is_plain(value))?;
+    let reason = "it is a list; give keys and their values, those of single joints by name, as limit = { shoulder = 2.0 }";
+    Some((format!("constraints.{key}"), reason))
 }
 
 /// `a.b.c=value`: the value is TOML, or a bare string.

@@ -53,7 +53,7 @@ fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("nearl-runtime: {error}");
+            nearl_runtime::tell!("nearl-runtime: {error}");
             ExitCode::from(exit_code(&error))
         }
     }

@@ -194,7 +194,8 @@ fn fault_42_a_driver_whose_files_are_truncated_is_told_to_brake() {
         "{}: {text}",
         output.status
     );
-    assert!(runtime.wait_with_output().unwrap().status.success());
+    let ended = runtime.wait_with_output().unwrap();
+    assert!(ended.status.success(), "{}", String::from_utf8_lossy(&ended.stdout));
 }
 
 /// Folders with long names hold nothing of the links: they lie in one place whatever TMPDIR says.

@@ -131,6 +131,12 @@ const FILES: &[(&str, &str, &str, &[&str])] = &[
     ),
     (
         "Panda-reach",
+        "velocity = { scale = 0.9 }",
+        "velocity = [0.5, 0.2]",
+        &["[constraints.velocity]", "it is a list", "limit = { shoulder = 2.0 }"],
+    ),
+    (
+        "Panda-reach",
         "margin = 0.01",
         "margin = 5.0",
         &["leaves nothing of its range", "'panda_joint1'", "'panda_joint7'", "rad"],
@@ -278,6 +284,27 @@ const COMMANDS: &[(&[&str], &[&str])] = &[
     ),
     (&["run", "panda", "--plant", "a", "--faults", "lost.json"], &["'lost.json'", "fault 2 of the list"]),
 ];
+
+/// The folder of a task file of one's own: the run's `task.toml` had taken its place.
+#[test]
+fn a_run_takes_no_file_s_place() {
+    let folder = folder();
+    let (task, out) = (folder.path().join("task.toml"), folder.path().display().to_string());
+    let text = format!("# mine\n{}", changed("cart-pole", "", ""));
+    std::fs::copy(repository().join("examples/tasks/cart-pole.xml"), folder.path().join("cart-pole.xml"))
+        .expect("robot");
+    std::fs::write(&task, &text).expect("task file");
+    let train = ["train", "task.toml", "--algo", "ppo", "--steps", "2048", "--out", &out];
+    assert_refused(
+        folder.path(),
+        &train,
+        b"",
+        &["task.toml' is there already", "give another folder with --out"],
+    );
+    assert_eq!(std::fs::read_to_string(&task).expect("text"), text);
+    let comma = ["train", "task.toml", "--set", "reward={ \"a,b\" = \"1\" }", "--out", "run"];
+    assert_refused(folder.path(), &comma, b"", &["[reward.a,b]", "no comma"]);
+}
 
 #[test]
 fn bad_arguments_are_refused_with_their_name() {

@@ -82,6 +82,27 @@ fn what_a_reset_draws_is_taken_as_it_was_recorded() {
     }
 }
 
+/// Lengths whose sum is that of the rows once it has gone round 2^64.
+#[test]
+fn lengths_that_no_file_holds_are_refused() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (file, _) = recorded(folder.path(), "Hopper-v5");
+    let mut arrays = npz::read(&std::fs::read(&file).expect("bytes")).expect("arrays");
+    let lengths = arrays.get_mut("lengths").expect("lengths");
+    let Values::Numbers(of) = &mut lengths.values else { panic!("numbers") };
+    let all: f64 = of.iter().sum();
+    *of = vec![2_f64.powi(64) - 4096.0, all + 4096.0 + of.len() as f64 - 2.0];
+    lengths.shape = vec![2];
+    let parts: Vec<(&str, Array)> =
+        arrays.iter().map(|(name, array)| (name.as_str(), array.clone())).collect();
+    std::fs::write(&file, npz::write(&parts)).expect("written");
+    let said = Demonstrations::load(&file).expect_err("no such episode").to_string();
+    assert!(
+        said.contains("episode 0 has the length 18446744073709548000; give whole numbers of steps, 1 to 1e9"),
+        "{said}"
+    );
+}
+
 /// NumPy reads what is written here, and what NumPy writes is read here.
 #[test]
 fn numpy_reads_and_writes_the_same_file() {

@@ -3,6 +3,7 @@
 use nearl_runtime::constraints::drive::{Arrival, Held};
 use nearl_runtime::constraints::{Drive, Dynamics, Model, Period, PeriodDynamics, Rung};
 use nearl_runtime::net::{Dense, Forward};
+use nearl_runtime::rt::Brake;
 use nearl_runtime::{Controller, PolicyKind, Snapshot, doctor};
 use nearl_tests::training;
 use nearl_trainer::env::{Env, Meter};
@@ -236,6 +237,60 @@ fn joints_that_nothing_drives_are_told_of_a_guard_by_the_model() {
         let told = doctor::told(&manifest).expect("notes");
         let found = told.iter().any(|note| note.contains("joints that nothing drives"));
         assert_eq!(found, is_told, "{guard}: {told:?}");
+    }
+}
+
+/// The loop's own brake of an arm on a base that floats: it had taken the base for one that stands, and swung.
+#[test]
+fn a_brake_lets_follow_what_nothing_drives() {
+    const LIMIT: f64 = 10.0;
+    let folder = tempfile::tempdir().expect("folder");
+    let body = |i: usize, inner: &str| {
+        format!(
+            "<body pos=\"0 0 0.4\"><joint name=\"j{i}\" axis=\"{}\" range=\"-2 2\" armature=\"0.01\"/><geom type=\"capsule\" size=\"0.03\" \
+             fromto=\"0 0 0 0.02 0.03 0.4\" mass=\"{}\" contype=\"0\" conaffinity=\"0\"/>{inner}</body>",
+            ["0 1 0", "1 0 0"][i % 2],
+            [2.0, 1.2, 0.7][i],
+        )
+    };
+    let arm = body(0, &body(1, &body(2, "")));
+    let motors: String =
+        (0..3).map(|i| format!("<motor name=\"m{i}\" joint=\"j{i}\" ctrlrange=\"-30 30\"/>")).collect();
+    let robot = format!(
+        "<mujoco><compiler angle=\"radian\"/><option timestep=\"0.004\" gravity=\"0 0 0\"/><worldbody><body name=\"base\"><freejoint name=\"root\"/>\
+         <geom type=\"box\" size=\"0.2 0.2 0.1\" mass=\"5\" contype=\"0\" conaffinity=\"0\"/>{arm}</body></worldbody><actuator>{motors}</actuator></mujoco>"
+    );
+    std::fs::write(folder.path().join("arm.xml"), robot).expect("robot");
+    let task = format!(
+        "name = \"arm\"\n[model]\nmjcf = \"arm.xml\"\n[time]\ndt = 0.004\nsim_dt = 0.004\n[state]\ncontrollable = [\"j0\", \"j1\", \"j2\"]\n\
+         observation = [\"q.j0\", \"q.j1\", \"q.j2\", \"v.j0\", \"v.j1\", \"v.j2\"]\n[reward]\nstill = \"1\"\n[idm]\nkind = \"pinocchio\"\n[constraints]\n\
+         position = {{}}\nvelocity = {{ limit = 2.0 }}\nacceleration = {{ limit = {LIMIT:.1} }}\ntorque = {{}}\n"
+    );
+    let file = folder.path().join("arm.toml");
+    for (guard, policy) in [("guard = true\n", PolicyKind::Direct), ("", PolicyKind::Stochastic)] {
+        std::fs::write(&file, format!("{task}{guard}")).expect("task");
+        let mut manifest = tasks::load(&file.display().to_string(), &[]).expect("task");
+        manifest.policy = policy;
+        train::complete(&mut manifest).expect("a whole task");
+        let mut brake = Brake::new(&manifest).expect("built").expect("a model that knows the action");
+        let mut env = nearl_trainer::env::of_task(&manifest, "arm").expect("environment");
+        let mut start = vec![0.0; env.qpos().len()];
+        start[3] = 1.0;
+        let (mut q, mut v) = (start.clone(), vec![0.0; 9]);
+        let fast: Vec<f64> = [0.0; 6].into_iter().chain([1.9, -1.5, 1.9]).collect();
+        env.set_state(&start, &fast).expect("state");
+        for tick in 0..250 {
+            env.state(&mut q, &mut v);
+            let before = v.clone();
+            let action = brake.update(&q, &v).1.to_vec();
+            let step = env.step(&action);
+            env.state(&mut q, &mut v);
+            for i in 6..9 {
+                let a = (v[i] - before[i]) / 0.004;
+                assert!(a.abs() <= LIMIT + 1e-7, "'{guard}' tick {tick}: {a} rad/s² of dof {i}, {step:?}");
+            }
+        }
+        assert!(v[6..].iter().all(|v| v.abs() < 1e-6), "'{guard}': {v:?}");
     }
 }
 

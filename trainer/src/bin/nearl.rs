@@ -10,7 +10,7 @@ fn main() -> ExitCode {
     match Cli::read().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {
-            eprintln!("nearl: {e}");
+            nearl_runtime::tell!("nearl: {e}");
             ExitCode::from(nearl_runtime::cli::exit_code(&e))
         }
     }

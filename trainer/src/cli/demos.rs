@@ -86,7 +86,7 @@ impl Record {
         let task = &snapshot.manifest.task;
         let drawn = [("random", &task.random), ("pushes", &task.pushes), ("delay", &task.delay)];
         for (section, _) in drawn.into_iter().filter(|(_, table)| !table.is_empty()) {
-            eprintln!(
+            nearl_runtime::tell!(
                 "nearl: warning: [{section}] draws something of its own in each episode, and '{}' does not say what: only with that do the \
                  actions lead from one recorded state to the next; to learn from the actions, record with --set '{section}={{}}'",
                 self.out.display()
@@ -117,7 +117,7 @@ impl Check {
                 .map_err(|e| format!("demonstrations '{}': {e}", self.file.display()))?;
             train::complete(&mut manifest)?;
             for line in train::demonstrated(&demos, &manifest)? {
-                eprintln!("nearl: warning: {line}");
+                nearl_runtime::tell!("nearl: warning: {line}");
             }
         }
         let lengths: Vec<usize> = demos.episodes.iter().map(|e| e.length).collect();

@@ -62,7 +62,7 @@ impl PlantCommand {
         let analytic = manifest.policy != PolicyKind::Direct && manifest.task.idm.kind == IdmKind::Pinocchio;
         let counts = time.sim_dt == 0.0 && (manifest.guards() || analytic);
         if let Some(step) = plant.sim_dt().filter(|_| counts) {
-            eprintln!(
+            nearl_runtime::tell!(
                 "nearl: the task counts on forces without steps (time.sim_dt is 0), and this simulation has steps of {step} s: limits hold but for the \
                  difference; with time.sim_dt = {step} they are exact here"
             );

@@ -113,7 +113,7 @@ impl SweepCommand {
             signal_hook::flag::register(signal, Arc::clone(&stop))?;
         }
         for line in advice(&sweep, &runs) {
-            eprintln!("nearl: warning: {line}");
+            nearl_runtime::tell!("nearl: warning: {line}");
         }
         let todo = runs.iter().filter(|r| r.found != Found::Finished).count() as u64;
         let bar = if self.json { ProgressBar::hidden() } else { ProgressBar::new(todo * sweep.steps) };
@@ -125,7 +125,7 @@ impl SweepCommand {
                 }
             };
             let error = |r: &Run, words: &str| match self.json {
-                true => eprintln!("{} {} seed {}: {words}", r.name, r.algo, r.seed),
+                true => nearl_runtime::tell!("{} {} seed {}: {words}", r.name, r.algo, r.seed),
                 false => line(r, words),
             };
             match event {

@@ -147,13 +147,13 @@ impl Run {
         let others = others(&header.manifest.task, task);
         if !others.is_empty() && Path::new(file).is_file() {
             let keys = others.join(", ");
-            eprintln!(
+            nearl_runtime::tell!(
                 "nearl: warning: the run goes on with the settings it was started with; '{file}' by itself has others under {keys}: if the \
                  file was changed since, and none of --set, --preset and --demos set these, start a new run with --out"
             );
         }
         if !run_folder::is_same_robot(&header.manifest, own) {
-            eprintln!(
+            nearl_runtime::tell!(
                 "nearl: warning: the run goes on with the robot it was started with, and the robot file of '{file}' is another, or was changed \
                  since; start a new run with --out for that"
             );
@@ -231,7 +231,7 @@ impl Train {
         let (mut last, mut faults, mut lines) = (None, 0, Lines::new(self.json));
         let report = |p: &Progress, _| {
             for line in advice.drain(..) {
-                bar.suspend(|| eprintln!("nearl: warning: {line}"));
+                bar.suspend(|| nearl_runtime::tell!("nearl: warning: {line}"));
             }
             show(&bar, self.json, p);
             lines.show(p, run.steps);
@@ -241,11 +241,14 @@ impl Train {
         };
         match &experience {
             Experience::Loop(name, _) => {
-                eprintln!("nearl: looking for the loop of '{name}', {} s at most", LOOP_PATIENCE.as_secs());
+                nearl_runtime::tell!(
+                    "nearl: looking for the loop of '{name}', {} s at most",
+                    LOOP_PATIENCE.as_secs()
+                );
             }
             Experience::Served(name, _) => {
                 let patience = SERVER_PATIENCE.as_secs();
-                eprintln!("nearl: looking for the rollout server '{name}', {patience} s at most");
+                nearl_runtime::tell!("nearl: looking for the rollout server '{name}', {patience} s at most");
             }
             _ => {}
         }
@@ -262,7 +265,7 @@ impl Train {
         };
         bar.finish_and_clear();
         if faults > 0 {
-            eprintln!("nearl: {}", unstable(faults));
+            nearl_runtime::tell!("nearl: {}", unstable(faults));
         }
         let stopped = stop.load(Ordering::Relaxed);
         let Some(end) = last else {
@@ -369,7 +372,11 @@ impl Lines {
         if self.due.is_some_and(|due| now >= due) {
             self.due = Some(now + BETWEEN_LINES);
             let speed = p.steps as f64 / p.seconds;
-            eprintln!("{} of {steps} steps, {}, {speed:.0} steps/s", p.steps, returned(p.return_mean, ""));
+            nearl_runtime::tell!(
+                "{} of {steps} steps, {}, {speed:.0} steps/s",
+                p.steps,
+                returned(p.return_mean, "")
+            );
         }
     }
 }

@@ -3,7 +3,7 @@
 //!
 //! Tags are read as they stand, not as MuJoCo's parser would: only numbers that ask for room matter here.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use nearl_runtime::constraints::{MAX_TEXT_BYTES, read_bounded};
 
@@ -46,25 +46,38 @@ const ASKS: &[(&str, &[&str])] = &[
 /// Elements that make copies: of themselves, and of what they hold.
 const COPIES: [&str; 3] = ["replicate", "composite", "flexcomp"];
 
-/// Refuses a file that asks for too much, itself or by what it includes from `folder`.
+/// Refuses a file that asks for too much, itself or by what it includes or attaches from `folder`, and one that names what is no regular file: a pipe would be
+/// waited for.
 ///
 /// # Errors
 /// One sentence with element, attribute, number and limit.
 pub(super) fn check(text: &str, folder: Option<&Path>) -> Result<(), String> {
-    Count { elements: 0.0, joints: 0.0, files: 0, folder }.file(text, 1.0, 0)
+    Count { elements: 0.0, joints: 0.0, files: 0, folder: folder.map(Path::to_owned), models: Vec::new() }
+        .file(text, 1.0, 0)
 }
 
-struct Count<'a> {
+struct Count {
     elements: f64,
     joints: f64,
     files: usize,
-    folder: Option<&'a Path>,
+    folder: Option<PathBuf>,
+    /// Models that may be attached: name, elements and joints.
+    models: Vec<(String, [f64; 2])>,
 }
 
-impl Count<'_> {
+/// Folders, beside that of the file, in which the files that its elements name may lie.
+const FOLDERS: [&str; 3] = ["assetdir", "meshdir", "texturedir"];
+
+impl Count {
     /// A text in which every element stands for `copies`, within `depth` others.
     fn file(&mut self, text: &str, copies: f64, depth: usize) -> Result<(), String> {
         let mut open = vec![copies];
+        let stated = tags(text).filter(|tag| tag.name == "compiler");
+        let folders: Vec<&str> = std::iter::once("")
+            .chain(
+                stated.flat_map(|tag| FOLDERS.iter().filter_map(move |key| attribute(tag.attributes, key))),
+            )
+            .collect();
         for tag in tags(text) {
             let Tag { name, attributes, kind } = tag;
             let copies = open.last().copied().unwrap_or(1.0);
@@ -75,8 +88,12 @@ impl Count<'_> {
                 continue;
             }
             let copies = copies * self.element(name, attributes, copies)?;
-            if name == "include" {
-                self.include(attributes, copies, depth + open.len())?;
+            self.named(name, attributes, &folders)?;
+            match name {
+                "include" => self.include(attributes, copies, depth + open.len())?,
+                "model" => self.model(attributes, copies, depth + open.len())?,
+                "attach" => self.attach(attributes, copies)?,
+                _ => {}
             }
             if kind == Kind::Open {
                 open.push(copies);
@@ -97,14 +114,7 @@ impl Count<'_> {
         if ["joint", "freejoint"].contains(&name) {
             self.joints += copies;
         }
-        for (most, found, what) in [(ELEMENTS, self.elements, "elements"), (JOINTS, self.joints, "joints")] {
-            if found > most || copies * own > ELEMENTS {
-                return Err(format!(
-                    "<{name}> makes {:.0} {what} of the file, {most:.0} at most: leave some out, or copy fewer",
-                    found.max(copies * own)
-                ));
-            }
-        }
+        self.is_within(name, copies * own)?;
         for (_, keys) in ASKS.iter().filter(|(element, _)| element.is_empty() || *element == name) {
             let numbers = keys.iter().filter_map(|key| product(attributes, key)).product::<f64>();
             if copies * numbers > NUMBERS {
@@ -125,8 +135,76 @@ impl Count<'_> {
         Ok(own)
     }
 
+    fn is_within(&self, name: &str, copied: f64) -> Result<(), String> {
+        for (most, found, what) in [(ELEMENTS, self.elements, "elements"), (JOINTS, self.joints, "joints")] {
+            if found > most || copied > ELEMENTS {
+                return Err(format!(
+                    "<{name}> makes {:.0} {what} of the file, {most:.0} at most: leave some out, or copy fewer",
+                    found.max(copied)
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Refuses a file that an element names and that is there, but is no regular one.
+    fn named(&self, name: &str, attributes: &str, folders: &[&str]) -> Result<(), String> {
+        let Some(folder) = &self.folder else { return Ok(()) };
+        for key in ["file", "filename"] {
+            let Some(file) = attribute(attributes, key) else { continue };
+            let bare = file.rsplit('/').next().unwrap_or_default();
+            for at in
+                folders.iter().flat_map(|within| [file, bare].map(|file| folder.join(within).join(file)))
+            {
+                let is_odd = std::fs::metadata(&at).is_ok_and(|facts| !facts.is_file() && !facts.is_dir());
+                if is_odd {
+                    return Err(format!(
+                        "<{name}> names '{}', which is no regular file: give one",
+                        at.display()
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// A model that may be attached, with all that it attaches itself.
+    fn model(&mut self, attributes: &str, copies: f64, depth: usize) -> Result<(), String> {
+        let (Some(folder), Some(file)) = (&self.folder, attribute(attributes, "file")) else { return Ok(()) };
+        let at = folder.join(file);
+        self.files += 1;
+        if self.files > INCLUDES {
+            return Err(format!(
+                "<model> '{file}' is one of more than {INCLUDES} files, or names itself: attach fewer"
+            ));
+        }
+        let Ok(bytes) = read_bounded(&at, MAX_TEXT_BYTES, true) else { return Ok(()) };
+        let folder = at.parent().map(Path::to_owned);
+        let mut own = Count { elements: 0.0, joints: 0.0, files: self.files, folder, models: Vec::new() };
+        own.file(&String::from_utf8_lossy(&bytes), 1.0, depth)?;
+        self.files = own.files;
+        self.elements += copies * own.elements;
+        let stem =
+            Path::new(file).file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
+        let name = attribute(attributes, "name").map_or(stem, str::to_owned);
+        self.models.push((name, [own.elements, own.joints]));
+        self.is_within("model", copies)
+    }
+
+    fn attach(&mut self, attributes: &str, copies: f64) -> Result<(), String> {
+        let name = attribute(attributes, "model").unwrap_or_default();
+        let of_name = self.models.iter().find(|(known, _)| known == name).map(|(_, counts)| *counts);
+        let most = |k: usize| self.models.iter().map(|(_, counts)| counts[k]).fold(0.0, f64::max);
+        let [elements, joints] = of_name.unwrap_or_else(|| [most(0), most(1)]);
+        self.elements += copies * elements;
+        self.joints += copies * joints;
+        self.is_within("attach", copies)
+    }
+
     fn include(&mut self, attributes: &str, copies: f64, depth: usize) -> Result<(), String> {
-        let (Some(folder), Some(file)) = (self.folder, attribute(attributes, "file")) else { return Ok(()) };
+        let (Some(folder), Some(file)) = (self.folder.clone(), attribute(attributes, "file")) else {
+            return Ok(());
+        };
         self.files += 1;
         if self.files > INCLUDES {
             return Err(format!(
@@ -263,6 +341,52 @@ mod tests {
         assert!(said(&"<body><joint/></body>".repeat(2001)).contains("<joint> makes 2001 joints"));
         assert!(said(&"<geom/>".repeat(200_001)).contains("elements"));
         assert!(said(&"<body>".repeat(500)).contains("stands within more than 400"));
+    }
+
+    /// Files of a few letters each: one that names itself, a chain in which each attaches the one before twice, and pipes.
+    #[test]
+    fn models_are_followed_and_pipes_are_refused() {
+        let folder = std::env::temp_dir().join(format!("nearl-sizes-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).expect("folder");
+        let write = |name: &str, text: &str| std::fs::write(folder.join(name), text).expect("written");
+        let said = |text: &str| check(text, Some(&folder)).map_or_else(|e| e, |()| String::new());
+        let own = "<mujoco><asset><model name=\"m\" file=\"own.xml\"/></asset></mujoco>";
+        write("own.xml", own);
+        assert!(
+            said(own).contains("'own.xml' is one of more than 256 files, or names itself"),
+            "{}",
+            said(own)
+        );
+        let body = |name: &str| {
+            format!("<worldbody><body name=\"{name}\"><joint/><geom size=\"1\"/></body></worldbody>")
+        };
+        write("x0.xml", &format!("<mujoco>{}</mujoco>", body("b")));
+        let chain = |k: usize| {
+            let attach = "<attach model=\"m\" body=\"b\" prefix=\"p\"/>";
+            format!(
+                "<mujoco><asset><model name=\"m\" file=\"x{}.xml\"/></asset><worldbody><body name=\"b\">{attach}{attach}</body></worldbody></mujoco>",
+                k - 1
+            )
+        };
+        (1..30).for_each(|k| write(&format!("x{k}.xml"), &chain(k)));
+        assert_eq!(said(&chain(3)), "");
+        assert!(
+            said(&chain(25)).contains("<attach> makes") && said(&chain(25)).contains("joints of the file"),
+            "{}",
+            said(&chain(25))
+        );
+        let pipe = folder.join("pipe");
+        let path = std::ffi::CString::new(pipe.to_str().expect("text")).expect("path");
+        // SAFETY: plain call with a path that ends with a zero.
+        assert_eq!(unsafe { libc::mkfifo(path.as_ptr(), 0o600) }, 0);
+        for text in [
+            "<mujoco><include file=\"pipe\"/></mujoco>",
+            "<mujoco><compiler meshdir=\".\"/><asset><mesh file=\"pipe\"/></asset></mujoco>",
+            "<robot><link><collision><geometry><mesh filename=\"package://x/pipe\"/></geometry></collision></link></robot>",
+        ] {
+            assert!(said(text).contains("pipe', which is no regular file"), "{text}: {}", said(text));
+        }
+        std::fs::remove_dir_all(&folder).expect("removed");
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::learn::{Algorithm, NearlSettings, Pid2Settings};
 use crate::rollout::RolloutError;
 use crate::settings::TrainSettings;
 use nearl_runtime::constraints::STOP_GAPS;
+use nearl_runtime::constraints::description::Motor;
 use nearl_runtime::controller::Parts;
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Manifest, PolicyKind};
@@ -272,7 +273,9 @@ pub(crate) fn beginnings(manifest: &Manifest) -> Result<Vec<String>, TrainError>
     }
     let mut lines = Vec::from_iter(unstated);
     let is_own = !manifest.task.reward.is_empty();
-    if is_own && ended == RESETS.0 {
+    // Of a drive, 0 is a place to go to.
+    let by_force = |motor: &Motor| motor.bias[1] == 0.0 && motor.bias[2] == 0.0;
+    if is_own && ended == RESETS.0 && states.parts.model.motors().iter().all(by_force) {
         lines.push(format!(
             "{ended} of {0} episodes end with their first control period, without an action: a condition of [termination] holds at once ({1}); compare what it \
              reads with a number",

@@ -3,6 +3,7 @@
 
 use super::parts::{held_dofs, unusable};
 use crate::arrival::{Arrivals, ROUNDS};
+use crate::followers::Followers;
 use crate::motors::Motors;
 use crate::snapshot::{Manifest, SnapshotError};
 use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposal, StateLayout, Target};
@@ -13,11 +14,8 @@ use nearl_constraints::{Bounds, Drive, Model, PeriodDynamics, Projector, Proposa
 ///     tau -> a with tau = R a + b + F(a)            forward dynamics over the period, with dry friction F
 ///         -> v + T a, q (+) (T v + kappa T^2 a)     the proposal
 ///         -> project -> a'                          as the proposal of any policy
-///         -> tau' = R a' + b + F(a')                on S_c, while the other dofs follow
+///         -> tau' = R a' + b + F(a')                on S_c, while the other dofs follow ([`Followers`])
 /// ```
-///
-/// What the other dofs do under `tau'` is not what they would have done under `tau`, and it changes what `a'` takes of the motors: the last two lines
-/// are repeated with it, until it is what was reckoned with.
 ///
 /// Dofs that something holds where they are ([`held_dofs`]) have no acceleration, whatever that takes; the others follow from the forces.
 /// Joints with a drive take their command for the force (see [`Drive`]). Where the plant makes several physics steps of a period they are made
@@ -26,8 +24,7 @@ pub(super) struct Guard {
     pub(super) projector: Projector,
     dynamics: PeriodDynamics,
     dofs: Vec<usize>,
-    /// Dofs that follow.
-    loose: Vec<usize>,
+    followers: Option<Followers>,
     motors: Motors,
     arrivals: Arrivals,
     pub(super) proposal: Proposal,
@@ -40,11 +37,6 @@ pub(super) struct Guard {
     step: Vec<f64>,
     on: nearl_constraints::Dynamics,
 }
-
-/// How often a tick is projected again because dofs that nothing drives do otherwise.
-const FOLLOWING: usize = 30;
-/// Difference of their velocities [rad/s or m/s] at which they do what was reckoned with.
-const FOLLOWED: f64 = 1e-11;
 
 impl Guard {
     /// The guard of a task whose actions are the commands to the controllable joints.
@@ -66,7 +58,7 @@ impl Guard {
         let driven: Vec<usize> = (0..nv).filter(|i| dofs.contains(i) || held.contains(i)).collect();
         Ok(Guard {
             dynamics: PeriodDynamics::new(model, &driven, m.task.period()),
-            loose: (0..nv).filter(|i| !driven.contains(i)).collect(),
+            followers: Followers::new(model, &driven, m.task.period()),
             proposal: Proposal::new(model),
             single: single.collect(),
             commands: vec![0.0; nv],
@@ -91,7 +83,9 @@ impl Guard {
             self.projector.pass(q, v, &self.proposal, next);
         }
         if hold && (beyond || self.is_moved(next)) {
-            self.follow((q, v), next);
+            if let Some(followers) = &mut self.followers {
+                followers.follow((q, v), &self.proposal, &mut self.projector, next);
+            }
             self.lead((q, v), next, action);
             self.arrivals.begin();
             for _ in 0..if self.projector.needs_what_is_reached() { ROUNDS } else { 0 } {
@@ -102,26 +96,6 @@ impl Guard {
         }
         if self.projector.needs_previous() {
             self.projector.remember(next);
-        }
-    }
-
-    /// Projects again with what the dofs that nothing drives do on the way to `next`, until that is what was reckoned with.
-    fn follow(&mut self, (q, v): (&[f64], &[f64]), next: &mut Target) {
-        let t = self.dynamics.period().dt;
-        for _ in 0..if self.loose.is_empty() { 0 } else { FOLLOWING } {
-            self.a.copy_from_slice(&next.acceleration);
-            self.dynamics.drive(&mut self.a, &mut self.tau);
-            let off = |&i: &usize| t * (self.a[i] - next.acceleration[i]).abs();
-            let off = self.loose.iter().map(off).fold(0.0, f64::max);
-            // A machine without an answer has none to go on from.
-            if off <= FOLLOWED || !off.is_finite() {
-                break;
-            }
-            for k in 0..self.loose.len() {
-                self.propose(v, self.loose[k]);
-            }
-            self.place_proposal(q);
-            self.projector.project_beside((q, v), &self.proposal, next);
         }
     }
 
@@ -139,28 +113,18 @@ impl Guard {
 
     /// Writes the proposal: the state at the end of the period under `action`. Returns what [`Arrivals::foresee`] does.
     fn foresee(&mut self, q: &[f64], v: &[f64], action: &[f64]) -> bool {
+        let period = *self.dynamics.period();
+        let (t, kappa) = (period.dt, period.kappa);
         for (k, &i) in self.dofs.iter().enumerate() {
             self.commands[i] = self.motors.command(k, action[self.motors.place(k)]);
         }
         let by = (&mut self.dynamics, self.projector.external_forces());
         let beyond = self.arrivals.foresee((q, v), by, &self.commands, self.projector.limits(), &mut self.a);
         for i in 0..v.len() {
-            self.propose(v, i);
+            let y = t * self.a[i];
+            self.proposal.v[i] = v[i] + y;
+            self.step[i] = t * v[i] + kappa * t * y;
         }
-        self.place_proposal(q);
-        beyond
-    }
-
-    /// Proposes for dof `i` what its acceleration leads to.
-    fn propose(&mut self, v: &[f64], i: usize) {
-        let (t, kappa) = (self.dynamics.period().dt, self.dynamics.period().kappa);
-        let y = t * self.a[i];
-        self.proposal.v[i] = v[i] + y;
-        self.step[i] = t * v[i] + kappa * t * y;
-    }
-
-    /// Writes the configuration that the steps of all dofs lead to.
-    fn place_proposal(&mut self, q: &[f64]) {
         if self.single.iter().any(Option::is_none) {
             self.on.integrate(q, &self.step, &mut self.proposal.q);
         }
@@ -169,6 +133,7 @@ impl Guard {
                 self.proposal.q[iq] = q[iq] + self.step[i];
             }
         }
+        beyond
     }
 
     /// Whether the target differs from the proposal in a controllable joint.

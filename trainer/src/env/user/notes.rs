@@ -8,7 +8,7 @@
 
 use super::expression::Expression;
 use super::quantity::{Names, Quantity};
-use super::settings::{Mistake, Term, Text, mistake};
+use super::settings::{Mistake, Term, Text, can_head_a_column, mistake};
 
 /// An expression told as its mean or its largest value.
 #[derive(Clone)]
@@ -42,6 +42,7 @@ impl Notes {
         let mut metrics = Vec::new();
         for (name, value) in section {
             let key = format!("metrics.{name}");
+            can_head_a_column(&key, name)?;
             let (is_max, value) = match value {
                 toml::Value::Table(table) => match (table.len(), table.get("max")) {
                     (1, Some(value)) => (true, value),

@@ -54,6 +54,21 @@ struct Weighted {
     of: String,
 }
 
+/// What is told by a name has a column of that name.
+///
+/// # Errors
+/// An empty name, and one with signs that a table of numbers or a terminal takes for something else.
+pub(super) fn can_head_a_column(key: &str, name: &str) -> Result<(), Mistake> {
+    let odd = |c: char| c.is_control() || c == ',' || c == '"' || ('\u{2028}'..='\u{202e}').contains(&c);
+    match name.is_empty() || name.contains(odd) {
+        true => Err(mistake(
+            key,
+            "a name has letters, digits, spaces and signs, and no comma, quote or end of a line; give it another",
+        )),
+        false => Ok(()),
+    }
+}
+
 /// Terms of a section at most.
 const MOST_TERMS: usize = 1000;
 
@@ -68,6 +83,7 @@ pub(super) fn terms(section: &str, table: &toml::Table, names: &Names) -> Result
     }
     let compile = |(name, value): (&String, &toml::Value)| {
         let key = format!("{section}.{name}");
+        can_head_a_column(&key, name)?;
         let (weight, of) = match value {
             toml::Value::Table(table) if section != "termination" => {
                 let weighted: Weighted = serde_path_to_error::deserialize(table.clone())
