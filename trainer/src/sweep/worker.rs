@@ -82,13 +82,13 @@ pub fn run(sweep: &Sweep, runs: &[Run], jobs: usize, stop: &AtomicBool, mut tell
     }
 }
 
-/// Starts `nearl train` on one thread. Of a run without a checkpoint, which has nothing to go on from, the metrics are removed first.
+/// Starts `nearl train` on one thread. Of a run without a checkpoint, which has nothing to go on from, what says that it is one is removed first.
 fn start(sweep: &Sweep, run: &Run) -> Result<Child, String> {
-    if run.found == Found::Broken {
-        let metrics = run.folder.join("metrics.csv");
-        match std::fs::remove_file(&metrics) {
+    for name in ["env.json", "metrics.csv"].iter().filter(|_| run.found == Found::Broken) {
+        let file = run.folder.join(name);
+        match std::fs::remove_file(&file) {
             Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
-                return Err(format!("cannot remove '{}': {e}", metrics.display()));
+                return Err(format!("cannot remove '{}': {e}", file.display()));
             }
             _ => {}
         }
