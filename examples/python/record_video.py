@@ -1,4 +1,4 @@
-"""Gymnasium's own RecordVideo on a NEARL environment, without a screen."""
+"""Gymnasium's own RecordVideo on a NEARL environment, without a screen. Needs `pip install moviepy`."""
 
 import sys
 

@@ -1,4 +1,5 @@
-"""Stable-Baselines3's PPO on the native vector: an adapter of forty lines, faster than `make_vec_env` with single environments."""
+"""Stable-Baselines3's PPO on the native vector: an adapter of forty lines, faster than `make_vec_env` with single environments.
+Needs `pip install stable-baselines3==2.9.2`."""
 
 import sys
 

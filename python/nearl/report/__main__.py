@@ -21,8 +21,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--summary", metavar="FILE.json", help="output of 'nearl run --json', or summary.json of 'nearl demo'", **several)
     parser.add_argument("--demos", metavar="FILE.npz", help="demonstrations; those of a --run are shown anyway", **several)
     parser.add_argument("--task", help="name or file of the task whose robot the demonstrations are of, for pictures")
-    parser.add_argument("--title", default="NEARL report")
-    parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE.html")
+    parser.add_argument("--title", default="NEARL report", help="of the page")
+    parser.add_argument("--out", type=Path, default=Path("report.html"), metavar="FILE.html", help="to write (default report.html)")
     given = parser.parse_args(arguments)
     try:
         with warnings.catch_warnings():

@@ -11,7 +11,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="nearl view", description="A running loop, or a training, in a browser.")
     parser.add_argument("name", metavar="NAME", help="as in `nearl run --plant NAME`, or the run folder of a training")
     parser.add_argument("--task", help="task name or file whose robot is drawn; by default the one that the loop names")
-    parser.add_argument("--port", type=int, default=8080)
+    parser.add_argument("--port", type=int, default=8080, help="of the page on 127.0.0.1 (default 8080)")
     parser.add_argument("--seconds", type=float, help="how long; by default until the loop is gone")
     given = parser.parse_args(arguments)
     try:
