@@ -107,6 +107,9 @@ fn a_trainer_killed_while_it_publishes_leaves_the_loop_running() {
 
 #[test]
 fn sigterm_brakes_and_ends_with_success() {
+    // `nohup` has it ignored, for what is started here too.
+    // SAFETY: a plain call; the test waits for no such signal itself.
+    unsafe { libc::signal(libc::SIGHUP, libc::SIG_DFL) };
     for signal in [libc::SIGTERM, libc::SIGINT, libc::SIGHUP] {
         let name = Name::new(&format!("signal{signal}"));
         let body = PointMass { q: 1.0, v: 1.0, ..PointMass::default() };

@@ -229,6 +229,9 @@ fn a_killed_runtime_trips_the_watchdog_and_the_plant_stands_still() {
 
 #[test]
 fn a_signal_ends_the_runtime_braked_and_with_success() {
+    // `nohup` has it ignored, for what is started here too.
+    // SAFETY: a plain call; the test waits for no such signal itself.
+    unsafe { libc::signal(libc::SIGHUP, libc::SIG_DFL) };
     for signal in [libc::SIGTERM, libc::SIGINT, libc::SIGHUP] {
         let name = Name::new(&format!("signal{signal}"));
         let plant = name.plant(&["--endless"]);
