@@ -653,8 +653,9 @@ fn listed(table: &toml::Table) -> Option<(String, &'static str)> {
         return Some((key.into(), "it is a list; give keys and their values, as { key = value }"));
     }
     let limits = table.get("constraints")?.as_table()?;
-    let is_plain =
-        |value: &toml::Value| value.as_array().is_some_and(|list| !list.iter().all(toml::Value::is_table));
+    // Names of joints are a list, and so are limits of several frames.
+    let is_number = |value: &toml::Value| value.is_float() || value.is_integer() || value.is_bool();
+    let is_plain = |value: &toml::Value| value.as_array().is_some_and(|list| list.iter().any(is_number));
     let (key, _) = limits.iter().find(|(_, value)| is_plain(value))?;
     let reason = "it is a list; give keys and their values, those of single joints by name, as limit = { shoulder = 2.0 }";
     Some((format!("constraints.{key}"), reason))
