@@ -2,7 +2,7 @@
 
 use nearl_constraints::{Dynamics, Model, Period, PeriodDynamics, Projector, Proposal, Status, Target};
 
-/// Dofs that nothing drives, holds or proposes: a floating base, a pole, a link of a gripper. What they do under the motors that lead the others to
+/// Dofs that nothing drives or holds, as a guard takes them: a floating base, a pole, a link of a gripper. What they do under the motors that lead the others to
 /// their target, they do to these motors too, so that the target is projected again with it:
 ///
 /// ```text

@@ -65,15 +65,12 @@ impl AnalyticIdm {
     pub fn new(m: &Manifest, model: &Model, dofs: &[usize]) -> Result<Self, SnapshotError> {
         let drives = Parts::drives(m, model, dofs)?;
         let motors = Parts::motors(model, dofs, &drives)?;
-        let proposed = match m.guards() {
-            true => Vec::new(), // what is proposed are actions
-            false => Parts::proposed_dofs(m, model)?,
+        let others = (0..model.nv()).filter(|i| !dofs.contains(i));
+        // What a guard does not command follows, unless it is held; for the rest a driver has means of its own that keep it as it is.
+        let led: Vec<usize> = match m.guards() {
+            true => held_dofs(model, dofs),
+            false => others.collect(),
         };
-        // They go where they are proposed, stay where they are held, or follow.
-        let held = held_dofs(model, dofs);
-        let led: Vec<usize> = (0..model.nv())
-            .filter(|i| !dofs.contains(i) && (proposed.contains(i) || held.contains(i)))
-            .collect();
         let driven: Vec<usize> = (0..model.nv()).filter(|i| dofs.contains(i) || led.contains(i)).collect();
         Ok(Self {
             dynamics: Dynamics::new(model),

@@ -77,21 +77,6 @@ impl Parts {
         Self::projector_of(m, model, controllable, Consistency::Kinematic)
     }
 
-    /// Dofs of whose joints the policy proposes something.
-    ///
-    /// # Errors
-    /// As [`Parts::new`].
-    pub(crate) fn proposed_dofs(m: &Manifest, model: &Model) -> Result<Vec<usize>, SnapshotError> {
-        let s = &m.task.state;
-        let layout = StateLayout::new(model, &s.observation, s.propose.as_deref(), s.controllable.as_deref())
-            .map_err(|e| unusable(&e))?;
-        let dof = |k| match layout.state_entry(k) {
-            Entry::Position { dof, .. } | Entry::Velocity { dof } => Some(dof),
-            Entry::Other => None,
-        };
-        Ok((0..layout.n_state()).filter_map(dof).collect())
-    }
-
     /// What each dof of the model is commanded (nv).
     ///
     /// # Errors
