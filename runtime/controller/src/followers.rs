@@ -2,8 +2,8 @@
 
 use nearl_constraints::{Dynamics, Model, Period, PeriodDynamics, Projector, Proposal, Status, Target};
 
-/// Dofs that nothing drives or holds, as a guard takes them: a floating base, a pole, a link of a gripper. What they do under the motors that lead the others to
-/// their target, they do to these motors too, so that the target is projected again with it:
+/// Dofs that nothing drives or holds, as a guard takes them: a floating base, a pole, a link of a gripper. What they do under the motors that lead the
+/// others to their target, they do to these motors too, so that the target is projected again with it:
 ///
 /// ```text
 ///     a' -> tau' = R a' + b + F(a')      on the driven dofs, while the others follow: a'' of them
