@@ -52,8 +52,15 @@ const COPIES: [&str; 3] = ["replicate", "composite", "flexcomp"];
 /// # Errors
 /// One sentence with element, attribute, number and limit.
 pub(super) fn check(text: &str, folder: Option<&Path>) -> Result<(), String> {
-    Count { elements: 0.0, joints: 0.0, files: 0, folder: folder.map(Path::to_owned), models: Vec::new() }
-        .file(text, 1.0, 0)
+    Count {
+        elements: 0.0,
+        joints: 0.0,
+        files: 0,
+        folder: folder.map(Path::to_owned),
+        models: Vec::new(),
+        within: Vec::new(),
+    }
+    .file(text, 1.0, 0)
 }
 
 struct Count {
@@ -63,6 +70,8 @@ struct Count {
     folder: Option<PathBuf>,
     /// Models that may be attached: name, elements and joints.
     models: Vec<(String, [f64; 2])>,
+    /// Files of models within which this one stands.
+    within: Vec<PathBuf>,
 }
 
 /// Folders, beside that of the file, in which the files that its elements name may lie.
@@ -174,13 +183,21 @@ impl Count {
         let at = folder.join(file);
         self.files += 1;
         if self.files > INCLUDES {
-            return Err(format!(
-                "<model> '{file}' is one of more than {INCLUDES} files, or names itself: attach fewer"
-            ));
+            return Err(format!("<model> '{file}' is one of more than {INCLUDES} files: attach fewer"));
+        }
+        if self.within.contains(&at) {
+            return Err(format!("<model> '{file}' attaches itself: take it out of that file"));
         }
         let Ok(bytes) = read_bounded(&at, MAX_TEXT_BYTES, true) else { return Ok(()) };
         let folder = at.parent().map(Path::to_owned);
-        let mut own = Count { elements: 0.0, joints: 0.0, files: self.files, folder, models: Vec::new() };
+        let mut own = Count {
+            elements: 0.0,
+            joints: 0.0,
+            files: self.files,
+            folder,
+            models: Vec::new(),
+            within: [&self.within[..], &[at.clone()]].concat(),
+        };
         own.file(&String::from_utf8_lossy(&bytes), 1.0, depth)?;
         self.files = own.files;
         self.elements += copies * own.elements;
@@ -352,11 +369,7 @@ mod tests {
         let said = |text: &str| check(text, Some(&folder)).map_or_else(|e| e, |()| String::new());
         let own = "<mujoco><asset><model name=\"m\" file=\"own.xml\"/></asset></mujoco>";
         write("own.xml", own);
-        assert!(
-            said(own).contains("'own.xml' is one of more than 256 files, or names itself"),
-            "{}",
-            said(own)
-        );
+        assert!(said(own).contains("'own.xml' attaches itself"), "{}", said(own));
         let body = |name: &str| {
             format!("<worldbody><body name=\"{name}\"><joint/><geom size=\"1\"/></body></worldbody>")
         };
@@ -371,7 +384,7 @@ mod tests {
         (1..30).for_each(|k| write(&format!("x{k}.xml"), &chain(k)));
         assert_eq!(said(&chain(3)), "");
         assert!(
-            said(&chain(25)).contains("<attach> makes") && said(&chain(25)).contains("joints of the file"),
+            said(&chain(25)).contains("<attach> makes") && said(&chain(25)).contains("of the file"),
             "{}",
             said(&chain(25))
         );
