@@ -196,7 +196,7 @@ impl Count {
             files: self.files,
             folder,
             models: Vec::new(),
-            within: [&self.within[..], &[at.clone()]].concat(),
+            within: [&self.within[..], std::slice::from_ref(&at)].concat(),
         };
         own.file(&String::from_utf8_lossy(&bytes), 1.0, depth)?;
         self.files = own.files;
