@@ -3,6 +3,7 @@
 #include <pinocchio/multibody.hpp>
 #include <exception>
 #include <string>
+#include <vector>
 
 #if defined(__AVX__) || EIGEN_DEFAULT_ALIGN_BYTES != 16 || !_GLIBCXX_USE_CXX11_ABI
 #error "the wheel is plain SSE2 with 16-byte Eigen alignment and the C++11 ABI: take -march and -mavx out of CXXFLAGS"
@@ -23,6 +24,17 @@ static inline Input input(const double *p, Eigen::Index n) { return Input(Eigen:
 
 struct nc_model {
   pin::Model model;
+  std::vector<int> borne; // idx_v of the free joints with an armature
+
+  // MuJoCo's armature of a free joint acts on the acceleration of its origin in the world, Pinocchio's on the change of the velocity's components in the
+  // moving body; they differ by w x v. Adds `sign` times the force of that to `force`.
+  void bear(const double *v, double sign, double *force) const {
+    using Three = Eigen::Map<const Eigen::Vector3d>;
+    for (const int i : borne) {
+      const Eigen::Vector3d turned = Three(v + i + 3).cross(Three(v + i));
+      for (int k = 0; k < 3; k++) force[i + k] += sign * model.armature[i + k] * turned[k];
+    }
+  }
 };
 
 struct nc_data {

@@ -19,6 +19,7 @@ int nc_rnea(const nc_model *m, nc_data *d, const double *q, const double *v, con
   const auto &x = m->model;
   return guard([&] {
     VectorMap(tau, x.nv) = pin::rnea(x, d->data, input(q, x.nq), input(v, x.nv), input(a, x.nv));
+    m->bear(v, 1.0, tau);
   });
 }
 
@@ -36,6 +37,7 @@ int nc_nle(const nc_model *m, nc_data *d, const double *q, const double *v, doub
   const auto &x = m->model;
   return guard([&] {
     VectorMap(nle, x.nv) = pin::nonLinearEffects(x, d->data, input(q, x.nq), input(v, x.nv));
+    m->bear(v, 1.0, nle);
   });
 }
 
@@ -44,14 +46,32 @@ int nc_nle_by_velocity(const nc_model *m, nc_data *d, const double *q, const dou
   return guard([&] {
     d->dq.setZero();
     pin::computeRNEADerivatives(x, d->data, input(q, x.nq), input(v, x.nv), Input(d->dq));
-    MatrixMap(by_velocity, x.nv, x.nv) = d->data.dtau_dv.transpose();
+    MatrixMap out(by_velocity, x.nv, x.nv); // its columns are the rows
+    out = d->data.dtau_dv.transpose();
+    for (const int i : m->borne) {
+      const auto v3 = [v, i](int k) { return v[i + k % 3]; };
+      const auto w3 = [v, i](int k) { return v[i + 3 + k % 3]; };
+      for (int k = 0; k < 3; k++) { // row k of w x v: w[k+1] v[k+2] - w[k+2] v[k+1]
+        const double armature = x.armature[i + k];
+        out(i + (k + 2) % 3, i + k) += armature * w3(k + 1);
+        out(i + (k + 1) % 3, i + k) -= armature * w3(k + 2);
+        out(i + 3 + (k + 1) % 3, i + k) += armature * v3(k + 2);
+        out(i + 3 + (k + 2) % 3, i + k) -= armature * v3(k + 1);
+      }
+    }
   });
 }
 
 int nc_aba(const nc_model *m, nc_data *d, const double *q, const double *v, const double *tau, double *a) {
   const auto &x = m->model;
   return guard([&] {
-    VectorMap(a, x.nv) = pin::aba(x, d->data, input(q, x.nq), input(v, x.nv), input(tau, x.nv), pin::Convention::WORLD);
+    if (m->borne.empty()) {
+      VectorMap(a, x.nv) = pin::aba(x, d->data, input(q, x.nq), input(v, x.nv), input(tau, x.nv), pin::Convention::WORLD);
+      return;
+    }
+    d->dq = input(tau, x.nv);
+    m->bear(v, -1.0, d->dq.data());
+    VectorMap(a, x.nv) = pin::aba(x, d->data, input(q, x.nq), input(v, x.nv), Input(d->dq), pin::Convention::WORLD);
   });
 }
 

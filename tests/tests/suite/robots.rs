@@ -7,7 +7,7 @@ use nearl_runtime::Snapshot;
 use nearl_runtime::constraints::convention as c;
 use nearl_runtime::constraints::description::{Command, RobotDescription};
 use nearl_runtime::constraints::{
-    AccelerationLimit, Dynamics, Limit, Model, PositionLimit, Projector, Settings,
+    AccelerationLimit, Dynamics, Limit, Model, Period, PositionLimit, Projector, Settings,
 };
 use nearl_runtime::snapshot::{ModelFormat, Simulation};
 use nearl_trainer::mj::{JointKind, Sim};
@@ -114,6 +114,18 @@ impl Pair {
         c::tau_to_mujoco(m, &q, &tau, &mut out);
         let off = relative(&out, self.sim.nle());
         assert!(off < 1e-10, "{name}: nle differs by {off:e}");
+        self.dynamics.aba(&q, &v, &tau, &mut out);
+        let off = relative(&out, &still);
+        assert!(off < 1e-9, "{name}: forward dynamics differ from inverse ones by {off:e}");
+        let period = Period::new(0.01, 5);
+        let mut rows = vec![0.0; nv * nv];
+        self.dynamics.motor_rows(&period, &q, &v, &mut rows, &mut out);
+        for (out, row) in out.iter_mut().zip(rows.chunks(nv)) {
+            *out += row.iter().zip(&still).map(|(r, a)| r * a).sum::<f64>();
+        }
+        self.dynamics.motors_without_friction(&period, &q, &v, &still, &mut tau);
+        let off = relative(&out, &tau);
+        assert!(off < 1e-11, "{name}: rows of the motors differ by {off:e}");
         if !m.notes().iter().any(|note| note.contains("fluid") || note.contains("tendons")) {
             self.dynamics.passive(&q, &v, &mut tau);
             c::tau_to_mujoco(m, &q, &tau, &mut out);
@@ -261,7 +273,8 @@ fn collection() -> tempfile::TempDir {
           <body name="second" pos="1 0 0"><joint name="slide_x" type="slide" axis="1 0 0" ref="-0.3"/>
             <joint name="pole" type="ball" pos="0 0 0.1" damping="0.1"/>
             <geom type="cylinder" size="0.02 0.4" mass="0.7"/></body>
-          <replicate count="3" offset="0 0.5 0" sep="_"><body name="cube" pos="0 0 2"><freejoint/><geom type="box" size="0.05 0.06 0.07"/></body></replicate>
+          <replicate count="3" offset="0 0.5 0" sep="_"><body name="cube" pos="0 0 2">
+            <joint type="free" armature="0.3" damping="0.1"/><geom type="box" size="0.05 0.06 0.07"/></body></replicate>
         </worldbody>
         <actuator><general name="roll" joint="elbow_roll" gear="-3" gainprm="5" biastype="affine" biasprm="0.7 0 -0.3" ctrlrange="-2 1"/>
           <position name="elbow" class="arm" joint="elbow"/><velocity name="finger" joint="finger" kv="40" ctrlrange="-1 1"/>
