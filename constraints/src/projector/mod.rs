@@ -222,12 +222,13 @@ impl Projector {
         if within.len() != self.within.len() {
             return Status::Refused(RefuseReason::WrongLength);
         }
-        let first_ns = target.ledger.duration_ns;
+        let (first_ns, raw) = (target.ledger.duration_ns, target.ledger.raw_violations);
         self.backup.go_back();
         self.within.copy_from_slice(within);
         let mut status = self.project_from_here(q, v, proposal, target);
         self.within.fill(FREE);
         target.ledger.duration_ns += first_ns;
+        target.ledger.raw_violations = raw;
         if matches!(status, Status::Clamped | Status::Solved) {
             status = Status::Slowed;
         }

@@ -7,7 +7,7 @@ use crate::motors::Motors;
 use crate::net::Forward;
 use crate::normaliser::CLIP;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::{Dynamics, Model, Period, Projector, Proposal, StateLayout, Target};
+use nearl_constraints::{Dynamics, Model, Period, PeriodDynamics, Projector, Proposal, StateLayout, Target};
 
 /// A Gaussian network I(a | s_c, s'_c): the mean action from the observation entries of S_c and their
 /// projected change, both in network space.
@@ -52,7 +52,8 @@ pub struct AnalyticIdm {
     motors: Motors,
     period: Period,
     pub(crate) arrivals: Arrivals,
-    followers: Option<Followers>,
+    /// What nothing drives, and where the motors and these lead.
+    followers: Option<(Followers, PeriodDynamics)>,
     tau: Vec<f64>,
     external: Vec<f64>,
 }
@@ -75,7 +76,8 @@ impl AnalyticIdm {
         Ok(Self {
             dynamics: Dynamics::new(model),
             arrivals: Arrivals::new(m, model, dofs, (&drives, &motors), &led),
-            followers: Followers::new(model, &driven, m.task.period()),
+            followers: Followers::new(model, &driven)
+                .map(|followers| (followers, PeriodDynamics::new(model, &driven, m.task.period()))),
             motors,
             dofs: dofs.to_vec(),
             period: m.task.period(),
@@ -105,14 +107,20 @@ impl AnalyticIdm {
         target: &mut Target,
         action: &mut [f64],
     ) {
-        if let Some(followers) = &mut self.followers {
-            followers.follow((q, v), proposal, projector, target);
+        if let Some((followers, dynamics)) = &mut self.followers {
+            dynamics.update(q, v, projector.external_forces());
+            followers.follow(dynamics, (q, v), proposal, projector, target);
         }
         self.action(q, v, target, projector.limits_of_tick(), action);
         self.arrivals.begin();
         for _ in 0..if projector.needs_what_is_reached() { ROUNDS } else { 0 } {
             let Some(within) = self.arrivals.held_back(v, target) else { break };
-            projector.project_within((q, v), proposal, within, target);
+            match &mut self.followers {
+                Some((followers, dynamics)) => {
+                    followers.follow_within(dynamics, (q, v), within, projector, target);
+                }
+                None => _ = projector.project_within((q, v), proposal, within, target),
+            }
             self.action(q, v, target, projector.limits_of_tick(), action);
         }
     }

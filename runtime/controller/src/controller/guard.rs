@@ -58,7 +58,7 @@ impl Guard {
         let driven: Vec<usize> = (0..nv).filter(|i| dofs.contains(i) || held.contains(i)).collect();
         Ok(Guard {
             dynamics: PeriodDynamics::new(model, &driven, m.task.period()),
-            followers: Followers::new(model, &driven, m.task.period()),
+            followers: Followers::new(model, &driven),
             proposal: Proposal::new(model),
             single: single.collect(),
             commands: vec![0.0; nv],
@@ -84,13 +84,24 @@ impl Guard {
         }
         if hold && (beyond || self.is_moved(next)) {
             if let Some(followers) = &mut self.followers {
-                followers.follow((q, v), &self.proposal, &mut self.projector, next);
+                followers.follow(&mut self.dynamics, (q, v), &self.proposal, &mut self.projector, next);
             }
             self.lead((q, v), next, action);
             self.arrivals.begin();
             for _ in 0..if self.projector.needs_what_is_reached() { ROUNDS } else { 0 } {
                 let Some(within) = self.arrivals.held_back(v, next) else { break };
-                self.projector.project_within((q, v), &self.proposal, within, next);
+                match &mut self.followers {
+                    Some(followers) => {
+                        followers.follow_within(
+                            &mut self.dynamics,
+                            (q, v),
+                            within,
+                            &mut self.projector,
+                            next,
+                        );
+                    }
+                    None => _ = self.projector.project_within((q, v), &self.proposal, within, next),
+                }
                 self.lead((q, v), next, action);
             }
         }
