@@ -1,6 +1,8 @@
 //! Runs episodes without noise, raw and projected, and reports their returns and violations.
 
+use crate::env::Worst as MeterWorst;
 use crate::rollout::{RolloutError, Scorer, Worker, make_env, stream};
+use crate::watch::Watch;
 use nearl_runtime::constraints::{ConstraintSettings, LimitSet, Model, PerJoint, build_limits};
 use nearl_runtime::controller::Margin;
 use nearl_runtime::{Manifest, Snapshot, SnapshotError};
@@ -28,6 +30,19 @@ pub struct Told {
     pub mean: f64,
     /// Largest of the episodes.
     pub largest: f64,
+}
+
+/// How the simulator kept a kind of limit, margins included.
+#[derive(Debug, Clone, Serialize)]
+pub struct Measured {
+    /// `acceleration` or `torque`.
+    pub limit: &'static str,
+    /// Ticks beyond it.
+    pub outside: u64,
+    /// Joint that came furthest beyond; empty where none did.
+    pub joint: String,
+    /// How far [rad/s² or m/s²; N m or N].
+    pub by: f64,
 }
 
 /// A row of `[constraints] reached`: one side of the range of a joint.
@@ -87,6 +102,8 @@ pub struct Evaluation {
     pub unavoided: u64,
     /// Furthest that the simulator came beyond a position and a velocity limit; only what was broken.
     pub worst: Vec<Worst>,
+    /// Accelerations and torques of the simulator, where they have limits.
+    pub measured: Vec<Measured>,
     /// Control periods that could not be simulated: each ended its episode with the reward 0.
     pub faults: u64,
     /// What a task of one's own tells of its episodes.
@@ -143,6 +160,7 @@ pub(crate) fn evaluate_by(
     let (model, layout) = (worker.controller.model(), worker.controller.layout());
     let own = without_margins(&snapshot.manifest, model, layout.controllable());
     worker.beyond = Some((own.map_err(RolloutError::from)?, [None; 2]));
+    worker.set_watch()?;
     let mode = if projection { "projected" } else { "raw" };
     let mut e = Evaluation {
         mode,
@@ -158,6 +176,7 @@ pub(crate) fn evaluate_by(
         replaced: 0,
         unavoided: 0,
         worst: Vec::new(),
+        measured: Vec::new(),
         faults: 0,
         told: Vec::new(),
         residual: 0.0,
@@ -198,7 +217,24 @@ pub(crate) fn evaluate_by(
         let beyond_margin = own.map_or(0.0, |x| x.by);
         e.worst.extend(excess.map(|x| Worst { limit, joint: joint(x.dof), by: x.by, beyond_margin }));
     }
+    e.measured = measured(&worker);
     Ok(e)
+}
+
+fn measured(worker: &Worker) -> Vec<Measured> {
+    let Some(meter) = worker.watch.as_ref().map(Watch::meter) else { return Vec::new() };
+    let limits = meter.limits();
+    let kinds = [
+        ("acceleration", &limits.acceleration, Some(meter.acceleration())),
+        ("torque", &limits.effort, meter.effort()),
+    ];
+    let kept = |(limit, ends, worst): (_, &Vec<f64>, Option<MeterWorst>)| {
+        let worst = worst.filter(|_| ends.iter().any(|end| end.is_finite()))?;
+        let joint = if worst.states > 0 { worker.joint_of(worst.index) } else { String::new() };
+        let by = if worst.states > 0 { worst.excess } else { 0.0 };
+        Some(Measured { limit, outside: worst.states, joint, by })
+    };
+    kinds.into_iter().filter_map(kept).collect()
 }
 
 fn reached(worker: &Worker, ticks: u64, by_episode: Vec<f64>) -> Option<Reached> {

@@ -31,5 +31,6 @@ pub mod sweep;
 pub mod tasks;
 pub mod train;
 pub mod vector;
+pub mod watch;
 
 pub use nearl_rollout_protocol as rollout_protocol;

@@ -2,8 +2,8 @@
 
 use crate::env::{Env, EnvError, Limits, Meter, Spec};
 use crate::foresight::Foresight;
-use crate::mj::{Inverse, MjError};
 use crate::rollout::stream;
+use crate::watch::{Watch, WatchError};
 use nearl_runtime::constraints::{Drive, Guard, LimitSet, Model, end_of_range};
 use nearl_runtime::controller::Parts;
 use nearl_runtime::link::{
@@ -23,18 +23,15 @@ pub const TOLERANCE: f64 = 1e-9;
 pub struct MujocoPlant {
     env: Box<dyn Env>,
     rng: ChaCha8Rng,
-    meter: Meter,
+    watch: Watch,
     /// Asks the simulator where an action leads, if the task says so.
     foresight: Option<Foresight>,
-    /// `None` where MuJoCo's step has no inverse, so that torque is not measured.
-    inverse: Option<Inverse>,
     drive: Option<Brake>,
     robot: Robot,
     action: Vec<f64>,
     followers: Vec<Follower>,
     /// `action` was applied last, and the robot did not brake by itself.
     is_sent: bool,
-    force: Vec<f64>,
     /// Configuration and velocity as the environment gives them, and as the robot's model has them.
     state: (Vec<f64>, Vec<f64>),
     seen: (Vec<f64>, Vec<f64>),
@@ -77,28 +74,39 @@ pub fn watched_limits(env: &dyn Env, model: &Model, set: &LimitSet) -> Limits {
     watched
 }
 
-/// A joint that is sent positions.
+/// A joint that is sent positions, or the targets of a drive.
 struct Follower {
     /// Its entry of an action.
     entry: usize,
+    /// Where it is in the environment's state.
+    at: (usize, usize),
     /// What it may decelerate by in a period [rad/s or m/s].
     slower: f64,
-    /// Mean speed on the way to what it was sent last [rad/s or m/s].
+    /// Mean speed on the way to what it was sent last [rad/s or m/s]; of a target there is none.
     mean: f64,
+    /// Stiffness, damping and largest force of a drive of targets.
+    drive: Option<[f64; 3]>,
 }
 
-/// Those of the joints that `drives` (nv) says are sent positions; `set` limits their acceleration.
+/// Those of the joints that `drives` (nv) says are sent positions or targets; `set` limits their acceleration and force.
 fn followers(spec: &Spec, model: &Model, drives: &[Drive], set: &LimitSet) -> Vec<Follower> {
-    let dof_of = |own: usize| {
-        let name = &spec.joints.iter().find(|joint| joint.idx_v == own)?.name;
-        model.joints().iter().find(|joint| joint.name == *name && joint.nv == 1).map(|joint| joint.idx_v)
+    let joint_of = |dof: usize| {
+        let own = spec.joints.iter().find(|joint| joint.idx_v == dof)?;
+        let joint = model.joints().iter().find(|joint| joint.name == own.name && joint.nv == 1)?;
+        Some(((own.idx_q, own.idx_v), joint.idx_v))
     };
-    let commanded = spec.actuators.iter().enumerate();
-    commanded
-        .filter_map(|(entry, actuator)| Some((entry, dof_of(actuator.dof)?)))
-        .filter(|&(_, dof)| drives[dof] == Drive::Position)
-        .map(|(entry, dof)| Follower { entry, slower: spec.dt * set.acceleration[dof], mean: 0.0 })
-        .collect()
+    let follower = |(entry, dof): (usize, usize)| {
+        let (at, dof) = joint_of(dof)?;
+        let drive = match drives[dof] {
+            Drive::Position => None,
+            Drive::Pd { stiffness, damping } => {
+                Some([stiffness, damping, model.effort_limit()[dof].min(set.effort[dof])])
+            }
+            Drive::Effort | Drive::Velocity => return None,
+        };
+        Some(Follower { entry, at, slower: spec.dt * set.acceleration[dof], mean: 0.0, drive })
+    };
+    spec.actuators.iter().map(|actuator| actuator.dof).enumerate().filter_map(follower).collect()
 }
 
 /// Where the entries of a joint are in the environment's state, and in that of the robot's model.
@@ -151,15 +159,12 @@ pub enum PlantError {
     /// The task's robot, layout or limits.
     #[error(transparent)]
     Task(#[from] SnapshotError),
-    /// MuJoCo.
-    #[error(transparent)]
-    Physics(#[from] MjError),
     /// The robot that is simulated is not the one that is controlled.
     #[error("the simulation is not of the robot that is controlled: {0}")]
     Robot(String),
     /// The limits to watch.
     #[error(transparent)]
-    Limits(#[from] crate::env::LimitError),
+    Watch(#[from] WatchError),
 }
 
 impl MujocoPlant {
@@ -174,8 +179,7 @@ impl MujocoPlant {
         let mut rng = stream(seed, 0);
         env.reset(&mut rng)?;
         let limits = watched_limits(env.as_ref(), &model, projector.limits());
-        let mut meter = Meter::new(limits.clone(), TOLERANCE, env.spec().dt)?;
-        meter.begin(env.qvel());
+        let watch = Watch::new(env.as_ref(), limits.clone())?;
         let (n_act, nq, nv) = (env.spec().n_act(), env.spec().nq, env.spec().nv);
         let commanded = manifest.action_lower.len();
         if n_act != commanded {
@@ -186,11 +190,10 @@ impl MujocoPlant {
         }
         let asks = manifest.task.constraints.guard == Guard::Simulator;
         let drives = Parts::drives(manifest, &model, layout.controllable())?;
-        Ok(Self {
+        let mut plant = Self {
             followers: followers(env.spec(), &model, &drives, projector.limits()),
             foresight: asks.then(|| Foresight::new(env.as_ref(), &limits)),
-            meter,
-            inverse: Inverse::new(env.sim())?,
+            watch,
             drive: Brake::new(manifest)?,
             robot: describe(manifest, false)?,
             places: places(env.spec(), &model)?,
@@ -199,11 +202,45 @@ impl MujocoPlant {
             rng,
             action: vec![0.0; n_act],
             is_sent: false,
-            force: vec![0.0; nv],
             state: (vec![0.0; nq], vec![0.0; nv]),
             episode: Episode { bits: STATE_RESET, ..Episode::default() },
             resets,
-        })
+        };
+        plant.stay();
+        Ok(plant)
+    }
+
+    /// Drives begin an episode on the positions that their joints are at.
+    fn stay(&mut self) {
+        self.action.fill(0.0);
+        for Follower { entry, at, mean, .. } in &mut self.followers {
+            (self.action[*entry], *mean) = (self.env.qpos()[at.0], 0.0);
+        }
+    }
+
+    /// What joints that are sent positions do without any: they slow down.
+    fn slow_down(&mut self) {
+        let dt = self.dt();
+        for Follower { entry, slower, mean, .. } in self.followers.iter_mut().filter(|f| f.drive.is_none()) {
+            *mean -= slower.min(mean.abs()).copysign(*mean);
+            self.action[*entry] += dt * *mean;
+        }
+    }
+
+    /// What motors do that nothing tells how to brake: forces and speeds are none, and a drive stays on its target, with no more than its largest force.
+    fn let_go(&mut self) {
+        self.slow_down();
+        for (entry, action) in self.action.iter_mut().enumerate() {
+            if !self.followers.iter().any(|follower| follower.entry == entry) {
+                *action = 0.0;
+            }
+        }
+        for Follower { entry, at, drive, .. } in &self.followers {
+            let Some([stiffness, damping, most]) = drive else { continue };
+            let (q, v) = (self.env.qpos()[at.0], self.env.qvel()[at.1]);
+            let force = (stiffness * (self.action[*entry] - q) - damping * v).clamp(-most, *most);
+            self.action[*entry] = q + (force + damping * v) / stiffness;
+        }
     }
 
     /// What the plant announces.
@@ -224,7 +261,7 @@ impl MujocoPlant {
 
     /// The meter of the simulator's own state.
     pub fn meter(&self) -> &Meter {
-        &self.meter
+        self.watch.meter()
     }
 
     /// Brings the state of the robot's model up to date.
@@ -260,16 +297,7 @@ impl MujocoPlant {
         } else if self.resets && e.tick >= self.env.spec().max_episode_steps as u64 {
             e.bits |= STATE_TRUNCATED;
         }
-        let sim = self.env.sim();
-        let known = if self.env.is_disturbed() {
-            self.force.fill(0.0);
-            self.env.spec().actuators.iter().for_each(|a| self.force[a.dof] = sim.applied_force_of(a.dof));
-            true
-        } else {
-            // A motion that MuJoCo cannot go back from is one of no known force.
-            self.inverse.as_mut().is_some_and(|inverse| inverse.force(sim, &mut self.force).is_ok())
-        };
-        self.meter.observe(self.env.qpos(), self.env.qvel(), known.then_some(&self.force[..]));
+        self.watch.observe(self.env.as_ref());
     }
 
     fn begin_episode(&mut self) {
@@ -280,7 +308,8 @@ impl MujocoPlant {
             assert!(refused < MOST_DRAWS, "{e}");
             nearl_runtime::tell!("nearl: the start of an episode is drawn again: {e}");
         }
-        self.meter.begin(self.env.qvel());
+        self.watch.begin(self.env.as_ref());
+        self.stay();
         self.is_sent = false;
         let e = &mut self.episode;
         *e = Episode { number: e.number + 1, last: e.total, bits: STATE_RESET, ..Episode::default() };
@@ -305,14 +334,14 @@ impl Plant for MujocoPlant {
     fn tally(&self, t: &mut TallyMessage) {
         let e = &self.episode;
         (t.episodes, t.episode_return, t.last_return) = (e.number, e.total, e.last);
-        for (i, found) in self.meter.records().into_iter().enumerate() {
+        for (i, found) in self.watch.meter().records().into_iter().enumerate() {
             found.iter().for_each(|worst| t.measure(i, worst.states, worst.excess));
         }
     }
 
     fn apply(&mut self, action: &ActionMessage) {
         let dt = self.dt();
-        for Follower { entry, mean, .. } in &mut self.followers {
+        for Follower { entry, mean, .. } in self.followers.iter_mut().filter(|f| f.drive.is_none()) {
             *mean = if self.is_sent { (action.action[*entry] - self.action[*entry]) / dt } else { 0.0 };
         }
         let n = self.action.len();
@@ -322,24 +351,22 @@ impl Plant for MujocoPlant {
     }
 
     fn hold(&mut self, _action: &ActionMessage) {
-        let dt = self.dt();
-        for Follower { entry, slower, mean } in &mut self.followers {
-            *mean -= slower.min(mean.abs()).copysign(*mean);
-            self.action[*entry] += dt * *mean;
-        }
+        self.slow_down();
         self.advance();
     }
 
-    /// The drive's own brake, where analytic inverse dynamics knows the torque that stops the robot; no action elsewhere.
+    /// The drive's own brake, where analytic inverse dynamics knows the torque that stops the robot; elsewhere motors are let go, and drives stay.
     fn brake(&mut self) {
         self.is_sent = false;
-        self.action.fill(0.0);
         if self.drive.is_some() {
             self.see();
         }
-        if let Some(brake) = &mut self.drive {
-            let (_, torque) = brake.update(&self.seen.0, &self.seen.1);
-            self.action.copy_from_slice(torque);
+        match &mut self.drive {
+            Some(brake) => {
+                let (_, torque) = brake.update(&self.seen.0, &self.seen.1);
+                self.action.copy_from_slice(torque);
+            }
+            None => self.let_go(),
         }
         self.advance();
     }

@@ -34,6 +34,9 @@ pub enum RolloutError {
     /// The snapshot.
     #[error(transparent)]
     Snapshot(#[from] SnapshotError),
+    /// The limits that an evaluation watches.
+    #[error(transparent)]
+    Watch(#[from] crate::watch::WatchError),
     /// More environments or steps than fit into memory.
     #[error(
         "[train.n_envs] = {n_envs}, [train.n_steps] = {n_steps}: {what} would take more memory than the {free} MB that are free; give fewer"

@@ -109,6 +109,17 @@ impl Eval {
                 e.mode, w.joint, w.limit, w.by
             ));
         }
+        for (e, m) in results.iter().flat_map(|e| e.measured.iter().map(move |m| (e, m))) {
+            let unit = if m.limit == "torque" { "N m or N" } else { "rad/s² or m/s²" };
+            let furthest = match m.outside {
+                0 => String::new(),
+                _ => format!("; joint '{}' came furthest, by {:.3e} {unit}", m.joint, m.by),
+            };
+            say(format!(
+                "{}: ticks beyond a limit on {} in the simulator: {} of {}{furthest}",
+                e.mode, m.limit, m.outside, e.ticks
+            ));
+        }
         for e in &results {
             for told in &e.told {
                 let (name, mean, largest) = (&told.name, told.mean, told.largest);

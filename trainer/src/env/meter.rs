@@ -148,6 +148,11 @@ impl Meter {
         Excess { position, velocity, acceleration, effort }
     }
 
+    /// What is compared with.
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
     /// States measured.
     pub fn states(&self) -> u64 {
         self.states

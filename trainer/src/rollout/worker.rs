@@ -9,6 +9,7 @@ use crate::demos::{self, Frame, Frames};
 use crate::env::{Env, EnvError, Fault};
 use crate::foresight::{Foresight, Verdict};
 use crate::plant::watched_limits;
+use crate::watch::Watch;
 use nearl_runtime::constraints::{Guard, LimitSet};
 use nearl_runtime::task::IdmKind;
 use nearl_runtime::{Controller, Excess, Networks, Noise, Output, PolicyKind, Snapshot, State};
@@ -52,6 +53,8 @@ pub struct Worker {
     pub(crate) excess: [Option<Excess>; 2],
     /// Limits that an evaluation measures too, and how far these were left.
     pub(crate) beyond: Option<(LimitSet, [Option<Excess>; 2])>,
+    /// The simulator's own state against the limits, in an evaluation.
+    pub(crate) watch: Option<Watch>,
     /// Policy steps left in the segment.
     left: usize,
     pub(super) history: Episode,
@@ -100,6 +103,7 @@ impl Worker {
             ticks: 0,
             excess: [None; 2],
             beyond: None,
+            watch: None,
             left: 0,
             history: Episode::default(),
             demonstrated: None,
@@ -116,6 +120,22 @@ impl Worker {
     /// Hands new networks to the controller.
     pub fn set_networks(&mut self, networks: &Networks) {
         self.controller.set_networks(networks);
+    }
+
+    /// Measures from now on how the simulator keeps the limits.
+    ///
+    /// # Errors
+    /// [`RolloutError::Watch`].
+    pub(crate) fn set_watch(&mut self) -> Result<(), RolloutError> {
+        let limits = watched_limits(&*self.env, self.controller.model(), self.controller.limits());
+        self.watch = Some(Watch::new(&*self.env, limits)?);
+        Ok(())
+    }
+
+    /// Name of the joint of a dof of the simulation.
+    pub(crate) fn joint_of(&self, dof: usize) -> String {
+        let joints = &self.env.spec().joints;
+        joints.iter().rfind(|joint| joint.idx_v <= dof).map_or_else(String::new, |joint| joint.name.clone())
     }
 
     /// Switches the projection, for comparisons.
@@ -240,6 +260,9 @@ impl Worker {
         self.rows.clear();
         self.draw(false);
         self.rows.collected.see(&self.state.obs);
+        if let Some(watch) = &mut self.watch {
+            watch.begin(&*self.env);
+        }
         loop {
             let (_, terminated) = self.policy_step();
             self.rows.collected.see(&self.state.obs);
@@ -346,6 +369,9 @@ impl Worker {
         self.excess = larger(&self.excess, excess);
         if let Some((limits, most)) = &mut self.beyond {
             *most = larger(most, self.controller.excess_over(limits, &self.actual));
+        }
+        if let Some(watch) = &mut self.watch {
+            watch.observe(&*self.env);
         }
         (step.reward, step.terminated)
     }
