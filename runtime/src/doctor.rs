@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::Args;
-use nearl_constraints::certify_braking;
+use nearl_constraints::{Drive, certify_braking};
 use rustix::time::{ClockId, clock_getres};
 use serde::Serialize;
 
@@ -287,6 +287,9 @@ fn holding(m: &Manifest, parts: &Parts) -> Check {
         };
     }
     let loads = holding::heaviest(model, limits, controllable, &period);
+    if let Some(text) = out_of_reach(m, parts, &loads) {
+        return warn(CheckCode::Holding, text);
+    }
     let share = |l: &holding::Load| l.needed / l.effort;
     let floats = model.joints().iter().any(|j| j.nv > 1 && !controllable.contains(&j.idx_v));
     let held = if floats { ", with its base held: what legs carry comes on top" } else { "" };
@@ -300,6 +303,41 @@ fn holding(m: &Manifest, parts: &Parts) -> Check {
             ),
         ),
     }
+}
+
+/// Share of the range of a drive's targets at either end that friction and weight may take.
+const TAKEN: f64 = 0.05;
+
+/// Joints that their drives hold in a part of their limits alone, because friction and weight take the rest of the way to the end of their targets.
+fn out_of_reach(m: &Manifest, parts: &Parts, loads: &[holding::Load]) -> Option<String> {
+    let Parts { model, layout, projector } = parts;
+    let drives =
+        Parts::drives(m, model, layout.controllable()).ok().filter(|_| m.proposes() && !m.bounds_drives())?;
+    let held = |(k, &i): (usize, &usize)| {
+        let ([low, high], rubs) = doubts::rubbing(m, parts, &drives, k)?;
+        let Drive::Pd { stiffness, .. } = drives[i] else { return None };
+        let weight = loads.iter().find(|load| load.dof == i)?.needed;
+        let way = rubs + weight / stiffness;
+        let ([from, to], limits) = ([low + way, high - way], projector.limits());
+        let margin = (from - limits.q_lower[i]).max(limits.q_upper[i] - to);
+        let is_far = margin > TAKEN * (high - low) && from < to;
+        is_far.then(|| {
+            format!(
+                "'{}' from {from:.4} to {to:.4} rad or m, {margin:.4} short of a limit on its position (friction {:.3}, weight at most {weight:.3} N m or N, \
+                 stiffness {stiffness})",
+                model.dof_name(i),
+                model.friction()[i],
+            )
+        })
+    };
+    let joints: Vec<String> = layout.controllable().iter().enumerate().filter_map(held).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "within the range of their targets drives are sure to hold {}: a joint that begins beyond is led back, and where no brake is found the whole robot \
+             stands (braked-no-verified-brake); give position so much margin, the actuators more ctrlrange or stiffness, or begin inside",
+            joints.join("; ")
+        )
+    })
 }
 
 /// Share of a drive's gains that is hardly known better.

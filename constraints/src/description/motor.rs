@@ -77,6 +77,16 @@ impl Motor {
         (torque / self.gear - self.passive(q, v)) / self.gain
     }
 
+    /// Whether it is a drive of positions, with any damping: it pushes with `gain (u - q)`.
+    pub fn follows_positions(&self) -> bool {
+        self.not_modelled.is_none() && self.gain > 0.0 && self.bias[1] == -self.gain
+    }
+
+    /// Whether it is a drive of speeds: it pushes with `gain (u - v)`.
+    pub fn follows_speeds(&self) -> bool {
+        self.not_modelled.is_none() && self.gain > 0.0 && self.bias[1] == 0.0 && self.bias[2] == -self.gain
+    }
+
     /// Force for the control 0.
     fn passive(&self, q: f64, v: f64) -> f64 {
         let [constant, per_position, per_velocity] = self.bias;

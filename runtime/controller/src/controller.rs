@@ -30,6 +30,7 @@ mod noise;
 mod parts;
 
 pub use dial::{Margin, merge_margins};
+pub use drive_box::force_left;
 pub use parts::{Parts, held_dofs, seen_entries};
 
 use crate::idm::{AnalyticIdm, LearnedIdm};

@@ -3,7 +3,7 @@
 use nearl_constraints::description::{Command, Motor, mimics};
 use nearl_constraints::{Drive, Dynamics, Kind, MADE_UP_FOR, Projector, REGISTRY};
 
-use crate::controller::{Parts, held_dofs};
+use crate::controller::{Parts, force_left, held_dofs};
 use crate::snapshot::{Manifest, ModelFormat, PolicyKind};
 use crate::task::IdmKind;
 use crate::unreachable;
@@ -30,6 +30,7 @@ pub(super) fn of(m: &Manifest, parts: &Parts) -> Vec<String> {
         notes.extend(cut_targets(m, parts, &drives));
     }
     if moves_by_model(m) {
+        notes.extend(stuck_targets(m, parts, &drives));
         notes.extend(held_targets(m, parts, &drives));
         notes.extend(swung_targets(m, parts, &drives));
         notes.extend(shaken_joints(m, parts, &drives));
@@ -38,8 +39,11 @@ pub(super) fn of(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(other_gains(parts, &drives));
     notes.extend(undriven(m, parts));
     notes.extend(beyond_motors(m, parts, &drives));
-    notes.extend(unguarded(m));
+    notes.extend(stopped(m, parts));
+    notes.extend(unguarded(m, parts));
+    notes.extend(without_range(m, parts));
     notes.extend(beyond_simulator(m));
+    notes.extend(beyond_drives(m, parts, &drives));
     notes.extend(far_poses(m, model));
     notes.extend(other_steps(m));
     notes.extend(of_several_joints(m, projector));
@@ -107,8 +111,10 @@ fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<Stri
 }
 
 /// Limits that nothing is held to: those of states, of a policy that gives actions; and a policy made elsewhere that has none.
-fn unguarded(m: &Manifest) -> Option<String> {
+fn unguarded(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String> {
     let of = &m.task.constraints;
+    let floats = model.joints().iter().any(|j| j.nv > 1 && !layout.controllable().contains(&j.idx_v));
+    let guard = if floats { "\"drive\"" } else { "true" };
     let has_limits = REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty());
     if m.policy != PolicyKind::Direct {
         return (m.algo == "import" && !has_limits).then(|| {
@@ -119,11 +125,10 @@ fn unguarded(m: &Manifest) -> Option<String> {
     }
     let is_off = of.guard.is_off();
     if is_off && !has_limits && m.task.policy.is_some() && !m.limits_actions() {
-        return Some(
-            "no limit holds: [constraints] names none, and guard is off, so this policy's actions are sent as they are; add guard = true and the limits, \
-             torque = { scale = 1.0 } among them, to [constraints] of the recipe"
-                .into(),
-        );
+        return Some(format!(
+            "no limit holds: [constraints] names none, and guard is off, so this policy's actions are sent as they are; add guard = {guard} and the limits, \
+             torque = {{ scale = 1.0 }} among them, to [constraints] of the recipe"
+        ));
     }
     // A guard decides the action, and nothing beside it may change it.
     let (but, first) = match (of.reached, &of.action) {
@@ -133,8 +138,27 @@ fn unguarded(m: &Manifest) -> Option<String> {
     };
     (is_off && has_limits).then(|| {
         format!(
-            "the limits on states under [constraints]{but} hold for nothing: this policy gives actions, and guard is off; {first}add guard = true to \
-             [constraints] to hold them"
+            "the limits on states under [constraints]{but} hold for nothing: this policy gives actions, and guard is off; {first}add guard = {guard} to \
+             [constraints] to hold {}",
+            if floats { "those of drives' forces" } else { "them" }
+        )
+    })
+}
+
+/// Simulated drives without a range of targets, which no environment takes.
+fn without_range(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String> {
+    m.simulation.as_ref().filter(|simulation| simulation.format == ModelFormat::Mjcf)?;
+    let named = |&i: &usize| {
+        let joint = model.dof_name(i);
+        let motor = model.motors().iter().find(|motor| motor.joint == joint)?;
+        (motor.follows_positions() && motor.control_range.is_none()).then(|| format!("'{}'", motor.name))
+    };
+    let names: Vec<String> = layout.controllable().iter().filter_map(named).collect();
+    (!names.is_empty()).then(|| {
+        format!(
+            "actuators {} have no ctrlrange, and no training and no `nearl plant` takes a robot file without: write one that goes beyond the range of the \
+             joint by what the drive needs to brake there, its largest force by its stiffness at most",
+            names.join(", ")
         )
     })
 }
@@ -170,6 +194,59 @@ fn beyond_simulator(m: &Manifest) -> Vec<String> {
              sent before, and each search for a better action is in vain; leave one of the two out"
                 .into(),
         );
+    }
+    notes
+}
+
+/// What a guard on the forces of drives does not hold, and what the plant has that it does not reckon with.
+fn beyond_drives(m: &Manifest, Parts { model, layout, projector }: &Parts, drives: &[Drive]) -> Vec<String> {
+    if !m.bounds_drives() {
+        return Vec::new();
+    }
+    let mut notes = Vec::new();
+    let kept = ["torque", "torque_rate", "acceleration"];
+    let named = REGISTRY.iter().filter(|kind| !(kind.build)(&m.task.constraints).is_empty());
+    let others: Vec<_> = named.map(|kind| kind.name).filter(|name| !kept.contains(name)).collect();
+    if !others.is_empty() {
+        notes.push(format!(
+            "constraints.guard is \"drive\", which keeps the forces of drives and nothing of the motion: nothing holds {} of [constraints]; leave them out, or \
+             write guard = true for a robot whose joints are all driven",
+            others.join(", ")
+        ));
+    }
+    let (period, limits) = (m.task.period(), projector.limits());
+    let swings = |&i: &usize| {
+        let Drive::Pd { stiffness, damping } = drives[i] else { return None };
+        let (effort, acceleration) = (limits.effort[i], limits.acceleration[i]);
+        let bounds = acceleration.is_finite()
+            && force_left(&period, (stiffness, damping), effort, acceleration) <= 0.0;
+        bounds.then(|| format!("'{}' ({acceleration} rad/s² or m/s², {effort} N m or N)", model.dof_name(i)))
+    };
+    let joints: Vec<String> = layout.controllable().iter().filter_map(swings).collect();
+    if !joints.is_empty() {
+        notes.push(format!(
+            "at their limits on acceleration the drives of {} change their force within a period of {} s by more than all of it, so that only the force at \
+             its start is kept; shorten time.dt, or lower the acceleration to what these joints do",
+            joints.join(", "),
+            period.dt
+        ));
+    }
+    let (delay, noise, random) = (&m.task.delay, &m.task.noise, &m.task.random);
+    let has = |table: &toml::Table, section: &str, keys: &[&str]| -> Vec<String> {
+        keys.iter().filter(|key| table.contains_key(**key)).map(|key| format!("{section}.{key}")).collect()
+    };
+    let otherwise = [
+        has(delay, "delay", &["action", "observation"]),
+        has(noise, "noise", &["q", "v", "bias"]),
+        has(random, "random", &["stiffness", "damping"]),
+    ]
+    .concat();
+    if !otherwise.is_empty() {
+        notes.push(format!(
+            "constraints.guard is \"drive\", which reckons with the state that is measured, targets that act at once and the gains of [command]: beside {} the \
+             forces of the simulated drives leave their limits; `nearl eval` counts the ticks",
+            otherwise.join(", ")
+        ));
     }
     notes
 }
@@ -323,21 +400,16 @@ fn shaken_joints(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dr
     })
 }
 
-/// Whether `motor` is a drive of targets, as its file has it.
-fn is_drive(motor: &Motor, by_speed: bool) -> bool {
-    let [_, by_q, by_v] = motor.bias;
-    let of_target = if by_speed { by_q == 0.0 && motor.gain == -by_v } else { motor.gain == -by_q };
-    motor.not_modelled.is_none() && motor.gain > 0.0 && of_target
-}
-
 /// Simulated drives that are sent positions or velocities, whose limits are of what is sent.
 fn followed(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
     m.simulation.as_ref().filter(|simulation| simulation.format == ModelFormat::Mjcf)?;
     let follows = |&&i: &&usize| {
-        let joint = model.dof_name(i);
-        let by_speed = drives[i] == Drive::Velocity;
-        matches!(drives[i], Drive::Position | Drive::Velocity)
-            && model.motors().iter().any(|motor| motor.joint == joint && is_drive(motor, by_speed))
+        let follows = match drives[i] {
+            Drive::Position => Motor::follows_positions,
+            Drive::Velocity => Motor::follows_speeds,
+            _ => return false,
+        };
+        model.motors().iter().any(|motor| motor.joint == model.dof_name(i) && follows(motor))
     };
     let joints: Vec<String> =
         layout.controllable().iter().filter(follows).map(|&i| format!("'{}'", model.dof_name(i))).collect();
@@ -374,18 +446,37 @@ fn beyond_motors(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dr
     })
 }
 
+/// Joints that nothing keeps from the stops at the ends of their ranges, though their motion has limits: a stop knows none.
+fn stopped(m: &Manifest, Parts { model, layout, projector }: &Parts) -> Option<String> {
+    let limits = projector.limits();
+    let by_model = m.guards() || m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
+    let meets = |&&i: &&usize| {
+        let at = model.joint_of_dof(i).idx_q;
+        let (low, high) = (model.lower_position_limit()[at], model.upper_position_limit()[at]);
+        let runs_on =
+            low.is_finite() && limits.q_lower[i] < low || high.is_finite() && limits.q_upper[i] > high;
+        let is_limited =
+            [limits.velocity[i], limits.acceleration[i], limits.jerk[i]].iter().any(|x| x.is_finite());
+        runs_on && is_limited && !limits.locked[i]
+    };
+    let joints: Vec<String> =
+        layout.controllable().iter().filter(meets).map(|&i| format!("'{}'", model.dof_name(i))).collect();
+    (by_model && !joints.is_empty()).then(|| {
+        format!(
+            "nothing keeps {} from the end of the range in the robot file: a stop there, on the robot or in a simulation, throws a joint out of its limits on \
+             velocity and acceleration; add position = {{ margin = 0.0 }} to [constraints], or take the range out of the robot file",
+            joints.join(", ")
+        )
+    })
+}
+
 /// Gains that `[command]` states other than the robot file's own drive has them; a policy's metadata has three decimals.
 fn other_gains(Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
     let same = |a: f64, b: f64| (a - b).abs() <= 1e-3 * a.abs().max(1.0);
     let other = |&i: &usize| {
         let (Drive::Pd { stiffness, damping }, joint) = (drives[i], model.dof_name(i)) else { return None };
-        let is_drive = |motor: &&Motor| {
-            motor.joint == joint
-                && motor.not_modelled.is_none()
-                && motor.gear == 1.0
-                && motor.gain > 0.0
-                && motor.gain == -motor.bias[1]
-        };
+        let is_drive =
+            |motor: &&Motor| motor.joint == joint && motor.gear == 1.0 && motor.follows_positions();
         let motor = model.motors().iter().find(is_drive)?;
         let (of_file, damped) = (motor.gain, 0.0 - motor.bias[2]);
         let differs = !(same(stiffness, of_file) && same(damping, damped));
@@ -429,6 +520,42 @@ fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
              is so; where they swing they may push the others harder than their motors can hold, which then leave their limits on position, velocity and \
              acceleration; take {instead}",
             loose.join(", ")
+        )
+    })
+}
+
+/// Ends of the target of the `k`-th controllable joint [rad or m], and the part of the way to them that makes up for its dry friction, of a drive of targets.
+pub(super) fn rubbing(m: &Manifest, parts: &Parts, drives: &[Drive], k: usize) -> Option<([f64; 2], f64)> {
+    let i = parts.layout.controllable()[k];
+    let Drive::Pd { stiffness, .. } = drives[i] else { return None };
+    let motors = Parts::motors(&parts.model, parts.layout.controllable(), drives).ok()?;
+    let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
+    let [low, high] = ends.map(|end| motors.command(k, end));
+    ((high - low).is_finite()).then(|| ([low, high], parts.model.friction()[i] / stiffness))
+}
+
+/// Drives whose targets end before they could make up for the dry friction of their joints.
+fn stuck_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> {
+    let stuck = |(k, &i): (usize, &usize)| {
+        let ([low, high], way) = rubbing(m, parts, drives, k)?;
+        (2.0 * way > high - low).then(|| {
+            let friction = parts.model.friction()[i];
+            format!(
+                "'{}' ({} N m or N, which takes {} rad or m of the {} that its range has)",
+                parts.model.dof_name(i),
+                short(friction),
+                short(2.0 * way),
+                short(high - low)
+            )
+        })
+    };
+    let joints: Vec<String> = parts.layout.controllable().iter().enumerate().filter_map(stuck).collect();
+    (!joints.is_empty()).then(|| {
+        format!(
+            "no target of their range has the drives of {} make up for dry friction either way: their limits on acceleration, velocity and position are not \
+             promised, nor are those of the joints that move them; give the actuators more ctrlrange or stiffness, or leave the joints out of \
+             state.controllable",
+            joints.join(", ")
         )
     })
 }

@@ -57,7 +57,7 @@ codes! {
         NonFiniteProposal = "braked-non-finite-proposal", "The policy proposed NaN or infinity several ticks in a row.",
             "Go back to an earlier snapshot: the training diverged.";
         NoVerifiedBrake = "braked-no-verified-brake", "Several ticks in a row no way to stop could be verified; the stored brake ran.",
-            "Lower acceleration or the proposals' size.";
+            "Lower acceleration or the proposals' size; if it lasts, a joint cannot be held: see `holding` of `nearl doctor SNAPSHOT`.";
         NoCertifiedAnswer = "braked-no-certified-answer", "Several ticks in a row no target passed the checker.",
             "The limits leave nothing to do there: run `nearl doctor SNAPSHOT` and loosen what it names.";
         NonFiniteDynamics = "braked-non-finite-dynamics", "Several ticks in a row the dynamics gave NaN or infinity.",

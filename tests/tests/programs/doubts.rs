@@ -175,6 +175,15 @@ const SET_UPS: &[SetUp] = &[
         check: Some("model"),
     },
     SetUp {
+        what: "a range in the robot file that no limit keeps the joints in",
+        robot: SAME,
+        task: ("position = { margin = 0.02 }\n", ""),
+        limits: None,
+        says: &["nothing keeps 'shoulder', 'elbow' from the end of the range", "position = { margin = 0.0 }"],
+        is_refused: false,
+        check: Some("model"),
+    },
+    SetUp {
         what: "a speed limit of a point, and five physics steps in a control period",
         robot: ("timestep=\"0.01\"", "timestep=\"0.002\""),
         task: (

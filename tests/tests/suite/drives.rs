@@ -1,12 +1,15 @@
 //! Robots on legs: whatever targets their drives are given, forces and their change stay within what the motors allow, also where one policy
 //! takes over from another. Balance is not promised; falls are counted.
 
-use nearl_constraints::Status;
+use nearl_constraints::{Period, Status};
 use nearl_runtime::command::CommandSection;
+use nearl_runtime::controller::force_left;
+use nearl_runtime::link::{ActionMessage, Message, Plant, StateMessage};
 use nearl_runtime::net::{Dense, DenseLayer};
 use nearl_runtime::normaliser::Normaliser;
 use nearl_runtime::{Controller, Networks, PolicyKind, Snapshot, Task};
 use nearl_tests::training;
+use nearl_trainer::plant::MujocoPlant;
 use nearl_trainer::rollout::stream;
 use nearl_trainer::{mj, robot};
 use rand::RngExt;
@@ -15,6 +18,8 @@ const XML: &str = include_str!("../../fixtures/quadruped.xml");
 /// Stiffness [N m/rad], damping [N m s/rad] and torque rate [N m/s].
 const GAINS: [f64; 3] = [40.0, 1.0, 4000.0];
 const DT: f64 = 0.001;
+/// By how much a joint may accelerate [rad/s²]; these light legs rarely do by more.
+const ACCELERATION: f64 = 3000.0;
 /// Ticks from one policy to the next.
 const SWITCH: usize = 250;
 const LEGS: [&str; 4] = ["FR", "FL", "RR", "RL"];
@@ -42,7 +47,7 @@ fn task(guard: &str) -> Task {
     let text = format!(
         "name = \"quadruped\"\n[model]\nmjcf = \"quadruped.xml\"\n[time]\ndt = {DT}\nsim_dt = 0.0005\npolicy_every = 20\n\
          [state]\nobservation = [{}, {}]\n[command]\ninterface = \"pd\"\nstiffness = {k:?}\ndamping = {d:?}\n\
-         [constraints]\nguard = {guard}\ntorque = {{}}\nacceleration = {{ limit = 3000.0 }}\ntorque_rate = {{ limit = {rate:?} }}\n\
+         [constraints]\nguard = {guard}\ntorque = {{}}\nacceleration = {{ limit = {ACCELERATION:?} }}\ntorque_rate = {{ limit = {rate:?} }}\n\
          [idm]\nkind = \"pinocchio\"\n",
         entries("q"),
         entries("v")
@@ -76,8 +81,10 @@ fn policy(seed: u64, guard: &str) -> Snapshot {
 
 #[derive(Debug)]
 struct Peaks {
-    /// Largest force at any physics step, as a share of the effort. Accelerations of these light legs stay below 3000 rad/s^2 nearly always.
+    /// Largest force at any physics step, as a share of the effort, of joints that have accelerated by no more than [`ACCELERATION`] since the tick began.
     force: f64,
+    /// Of the others: in how many steps of a joint.
+    sudden: u64,
     /// Largest change of a force from tick to tick [N m/s], away from switches and at them.
     rate: [f64; 2],
     /// Ticks whose targets were moved.
@@ -92,7 +99,7 @@ fn run(way: Way, ticks: usize) -> Peaks {
     let mut sim = mj::Sim::new(&model).expect("simulation");
     let mut controller = Controller::new(&policies[0]).expect("controller");
     let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
-    let mut peaks = Peaks { force: 0.0, rate: [0.0; 2], moved: 0, falls: 0 };
+    let mut peaks = Peaks { force: 0.0, sudden: 0, rate: [0.0; 2], moved: 0, falls: 0 };
     let mut before: Option<Vec<f64>> = None;
     for tick in 0..ticks {
         if tick % (4 * SWITCH) == 0 || sim.qpos()[2] < 0.12 {
@@ -126,10 +133,16 @@ fn run(way: Way, ticks: usize) -> Peaks {
             peaks.rate[usize::from(switched)] = peaks.rate[usize::from(switched)].max(rate);
         }
         before = Some(start);
-        for _ in 0..2 {
+        let begun = sim.qvel().to_vec();
+        for step in 0..2 {
             for i in 0..12 {
                 let pull = force(&sim, i);
-                peaks.force = peaks.force.max(pull.abs() / EFFORT[i % 3]);
+                let change = (sim.qvel()[6 + i] - begun[6 + i]).abs();
+                if change > ACCELERATION * 0.5 * DT * f64::from(step) + 1e-9 {
+                    peaks.sudden += 1;
+                } else {
+                    peaks.force = peaks.force.max(pull.abs() / EFFORT[i % 3]);
+                }
                 sim.force_mut()[6 + i] = pull;
             }
             sim.step(1).expect("a step");
@@ -143,12 +156,13 @@ fn forces_and_their_change_stay_within_the_motors_also_where_policies_switch() {
     let [raw, cut, guarded] = [Way::Raw, Way::Cut, Way::Guarded].map(|way| run(way, 20_000));
     for (name, p) in [("raw", &raw), ("cut", &cut), ("guarded", &guarded)] {
         println!(
-            "{name}: peak force {:.3} of the effort, rate {:.0} N m/s and {:.0} at a switch, {} falls, {} ticks moved",
-            p.force, p.rate[0], p.rate[1], p.falls, p.moved
+            "{name}: peak force {:.3} of the effort, rate {:.0} N m/s and {:.0} at a switch, {} falls, {} ticks moved, {} sudden",
+            p.force, p.rate[0], p.rate[1], p.falls, p.moved, p.sudden
         );
     }
     assert!(raw.force > 1.2 && cut.rate[1] > 2.0 * GAINS[2], "the attack must be one");
     assert!(guarded.force <= 1.0 + 1e-9, "{}", guarded.force);
+    assert!(guarded.sudden < 4800, "{} of 480,000 steps of a joint are too sudden to judge", guarded.sudden);
     assert!(guarded.rate.iter().all(|rate| *rate <= GAINS[2] * (1.0 + 1e-9)), "{:?}", guarded.rate);
     assert!(guarded.moved > 100);
 }
@@ -194,8 +208,8 @@ fn targets_within_the_intervals_are_not_touched() {
             let asked = f64::from(out.sampled[i]);
             broken += u32::from(out.action[i] != asked);
             let force = GAINS[0] * (asked - state.q[7 + i]);
-            // What 3000 rad/s^2 may add within the tick is kept free.
-            let room = EFFORT[i % 3] - (GAINS[1] + 0.5 * GAINS[0] * DT) * 3000.0 * DT;
+            // What the acceleration may add within the tick is kept free.
+            let room = EFFORT[i % 3] - (GAINS[1] + 0.75 * GAINS[0] * DT) * ACCELERATION * DT; // two physics steps
             let allowed = force.abs() <= room;
             assert_eq!(allowed, out.action[i].to_bits() == asked.to_bits(), "{force} N m");
             same += usize::from(allowed);
@@ -205,6 +219,62 @@ fn targets_within_the_intervals_are_not_touched() {
         assert_eq!(ledger.status == Status::Clamped, broken > 0);
     }
     assert!(same > 1000, "{same}");
+}
+
+/// Physics steps by hand: a joint that accelerates as hard as it may ends with all of its effort, and no more.
+#[test]
+fn a_force_is_at_most_the_effort_at_the_end_of_a_tick_of_any_steps() {
+    let ([k, d, _], acceleration, effort) = (GAINS, 300.0, EFFORT[0]);
+    for steps in [1, 2, 5, 20_000] {
+        let tau = 0.005 / f64::from(steps);
+        let room = force_left(&Period::new(0.005, steps), (k, d), effort, acceleration);
+        let (mut q, mut v) = (0.3, -2.0);
+        let target = q + 0.005 * v + (d * v - room) / k; // the least that the end allows
+        for _ in 0..steps {
+            v += tau * acceleration;
+            q += tau * v;
+        }
+        let end = k * (target - q) - d * v;
+        assert!((end + effort).abs() < 1e-9, "{steps} steps: {end} N m");
+    }
+}
+
+const ARM: &str = r#"<mujoco model="arm"><option timestep="0.002"/><compiler angle="radian" autolimits="true"/><worldbody>
+<body><joint name="j1" axis="0 1 0" range="-2 2" damping="1" armature="0.1"/><geom type="capsule" size="0.03" fromto="0 0 0 0 0 0.3"/></body>
+</worldbody><actuator><position name="a1" joint="j1" kp="200" kv="20" ctrlrange="-2.5 2.5" forcerange="-60 60"/></actuator></mujoco>"#;
+
+/// Nothing knows how to brake drives of a policy that gives actions: the plant had sent every joint to 0 instead.
+#[test]
+fn a_plant_that_nothing_leads_has_its_drives_stay_where_they_were_sent() {
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::write(folder.path().join("arm.xml"), ARM).expect("robot");
+    let task = "name = \"arm\"\n[model]\nmjcf = \"arm.xml\"\n[time]\ndt = 0.002\nsim_dt = 0.002\n[state]\ncontrollable = [\"j1\"]\n\
+                observation = [\"q.j1\", \"v.j1\"]\n[command]\ninterface = \"pd\"\nstiffness = 200.0\ndamping = 20.0\n\
+                [constraints]\nguard = \"drive\"\ntorque = { scale = 0.5 }\n[reset]\nq = { j1 = 1.0 }\n[reward]\nstill = 1.0\n[idm]\nkind = \"pinocchio\"\n\
+                [train]\nn_envs = 2\nn_steps = 16\n[train.ppo]\nbatch_size = 32\n";
+    let file = folder.path().join("arm.toml");
+    std::fs::write(&file, task).expect("task");
+    let snapshot = training(file.to_str().expect("UTF-8"), "ppo", 1, 1, &[]).snapshot().clone();
+    let mut plant = MujocoPlant::new(&snapshot.manifest, 0, false).expect("a plant");
+    let (mut state, mut action) = (StateMessage::zeroed(), ActionMessage::zeroed());
+    let mut stays = |plant: &mut MujocoPlant, at: f64| {
+        (0..500).for_each(|_| plant.brake());
+        plant.observe(&mut state);
+        assert!((state.q[0] - at).abs() < 0.05, "{} where it was to stay at {at}", state.q[0]);
+    };
+    stays(&mut plant, 1.0);
+    (action.nu, action.action[0]) = (1, 1.1);
+    (0..200).for_each(|_| plant.apply(&action));
+    stays(&mut plant, 1.1);
+    action.action[0] = -1.0;
+    plant.apply(&action);
+    let before = plant.meter().effort().expect("forces").states;
+    (0..500).for_each(|_| plant.brake());
+    assert_eq!(
+        plant.meter().effort().expect("forces").states,
+        before,
+        "no brake asks for more than the limit"
+    );
 }
 
 /// A policy that proposes states is projected, and the drives of its learned inverse model are bounded besides: the ledger of the tick says what

@@ -15,7 +15,7 @@ codes! {
         BrakedNoCertifiedAnswer = "braked-no-certified-answer", "No target passed the checker; every joint brakes.",
             "The torque limits leave nothing to do there: run `nearl doctor SNAPSHOT` and loosen what it names.";
         BrakedNoVerifiedBrake = "braked-no-verified-brake", "No way to stop could be verified; the stored brake is executed.",
-            "Nothing to do; if it happens often, lower acceleration or the proposals' size.";
+            "If it happens often, lower acceleration or the proposals' size; if it lasts, a joint cannot be held: see `holding` of `nearl doctor SNAPSHOT`.";
         BrakedNonFiniteDynamics = "braked-non-finite-dynamics", "The dynamics gave NaN or infinity; every joint brakes.",
             "Check the robot file's masses and the plant's velocities.";
         RefusedNonFiniteState = "refused-non-finite-state", "The measured state held NaN or infinity.",

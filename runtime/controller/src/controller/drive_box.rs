@@ -4,7 +4,7 @@
 use super::Parts;
 use super::parts::unusable;
 use crate::snapshot::{Manifest, SnapshotError};
-use nearl_constraints::{ActionReport, Drive, Model, Projector, Recent};
+use nearl_constraints::{ActionReport, Drive, Model, Period, Projector, Recent};
 
 /// A force further than this beyond its interval [N·m or N] counts as a limit that was broken.
 const TOLERANCE: f64 = 1e-9;
@@ -14,14 +14,15 @@ const TOLERANCE: f64 = 1e-9;
 ///
 /// ```text
 ///     start:  |K (q* - q) - D v| <= E       and   |K (q* - q) - D v - tau_before| <= R T
-///     end:    |K (q* - q - T v) - D v| <= E - (D T + K T^2 / 2) A
+///     end:    |K (q* - q - T v) - D v| <= E - (D T + kappa K T^2) A
 /// ```
 ///
 /// That is an interval of `q*` for each joint, and `tau_before` is always in the one of the start. `A` is the acceleration limit, where there is
-/// one: by how much the joint may leave the path of its velocity within the tick. Where the end asks for more than the start allows, the start decides.
+/// one: by how much the joint may leave the path of its velocity within the tick, with `kappa` of [`Period`](nearl_constraints::Period). Where the end asks for
+/// more than the start allows, the force goes as far as that does; where nothing is left of `E` there is no end to keep ([`force_left`]).
 pub(super) struct DriveBox {
     joints: Vec<Joint>,
-    dt: f64,
+    period: Period,
     /// Forces at the start of the last ticks (n_act); not known at the start of an episode, when no rate holds.
     forces: Recent,
     /// Those of the tick under way (n_act).
@@ -77,7 +78,7 @@ impl DriveBox {
         };
         let joints = dofs.iter().enumerate().map(joint).collect::<Result<Vec<_>, _>>()?;
         let n = joints.len();
-        Ok(DriveBox { dt: m.task.time.dt, forces: Recent::new(n), force: vec![0.0; n], joints })
+        Ok(DriveBox { period: m.task.period(), forces: Recent::new(n), force: vec![0.0; n], joints })
     }
 
     /// Where in the action the `k`-th controllable joint's command is.
@@ -93,7 +94,7 @@ impl DriveBox {
         for (k, (joint, given)) in self.joints.iter().zip(&mut self.force).enumerate() {
             let action = &mut action[joint.at];
             let (at, v) = (q[joint.idx_q], v[joint.dof]);
-            let (low, high) = joint.forces(v, self.dt, before.map(|before| before[k]));
+            let (low, high) = joint.forces(v, &self.period, before.map(|before| before[k]));
             let asked = joint.stiffness * (*action - at) - joint.damping * v;
             let broken = u32::from(asked < low - TOLERANCE || asked > high + TOLERANCE);
             report.raw_violations += broken;
@@ -130,18 +131,24 @@ impl DriveBox {
     }
 }
 
+/// What is left of `effort` at the end of a tick whose joint accelerates by `acceleration` all along, for the force that its drive begins with.
+pub fn force_left(period: &Period, (stiffness, damping): (f64, f64), effort: f64, acceleration: f64) -> f64 {
+    effort - (damping + period.kappa * stiffness * period.dt) * acceleration * period.dt
+}
+
 impl Joint {
     /// Least and largest force at the start of a tick.
-    fn forces(&self, v: f64, dt: f64, before: Option<f64>) -> (f64, f64) {
-        let step = self.rate * dt;
+    fn forces(&self, v: f64, period: &Period, before: Option<f64>) -> (f64, f64) {
+        let step = self.rate * period.dt;
         let (mut low, mut high) = (-self.effort, self.effort);
         if let Some(before) = before {
             (low, high) = ((before - step).clamp(low, high), (before + step).clamp(low, high));
         }
-        let falls = self.stiffness * dt * v;
-        let room = self.effort - (self.damping + 0.5 * self.stiffness * dt) * self.acceleration * dt;
-        let (end_low, end_high) = (falls - room, falls + room);
-        let narrowed = (low.max(end_low), high.min(end_high));
-        if narrowed.0 <= narrowed.1 { narrowed } else { (low, high) }
+        let falls = self.stiffness * period.dt * v;
+        let room = force_left(period, (self.stiffness, self.damping), self.effort, self.acceleration);
+        if room < 0.0 {
+            return (low, high);
+        }
+        ((falls - room).clamp(low, high), (falls + room).clamp(low, high))
     }
 }
