@@ -92,7 +92,12 @@ def import_onnx(
         if os.fspath(path) in str(error):
             raise
         raise ValueError(f"'{os.fspath(path)}': {error}") from None
-    return _place(policy, robot, recipe, task, name, actions)
+    try:
+        return _place(policy, robot, recipe, task, name, actions)
+    except ValueError as error:
+        if not str(error).startswith("metadata '"):
+            raise
+        raise ValueError(f"'{os.fspath(path)}': {error}") from None
 
 
 def import_torch(
@@ -108,15 +113,15 @@ def import_torch(
     output_clip: tuple[float, float] = (-math.inf, math.inf),
     name: str = "policy",
 ) -> Controller:
-    """The controller of a policy that is a ``torch.nn.Sequential`` of linear layers, or that has one as its ``actor``.
+    """The controller of a policy that is a ``torch.nn.Sequential`` of linear layers, or that has one as its ``actor``, or of a model of rsl_rl (``MLPModel``).
 
     Of a module with a ``forward`` of its own, give the Sequential inside (``module.net``) where that is all it runs; else export it with
-    ``torch.onnx.export`` and read the file with :func:`import_onnx`. A module with an ``actor`` is run on some observations (``act_inference``, else
-    ``forward``), and refused where that gives anything else than what was read.
+    ``torch.onnx.export`` and read the file with :func:`import_onnx`. A module with an ``actor``, and a model, is run on some observations (``act_inference``,
+    else ``forward``), and refused where that gives anything else than what was read.
 
     Args:
-        module: The live object. What normalises observations beside its ``actor`` is read with it: an ``EmpiricalNormalization`` of rsl_rl, or a
-            ``BatchNorm1d`` that does not learn.
+        module: The live object. What normalises observations beside its ``actor``, or a model's ``mlp``, is read with it: an ``EmpiricalNormalization``
+            of rsl_rl, or a ``BatchNorm1d`` that does not learn. The ``mlp`` alone is the network without its normaliser.
         robot: URDF or MJCF file; or ``task``.
         recipe: As for :func:`import_onnx`.
         task: In place of robot and recipe, the task whose observation the policy sees: a bundled one or a TOML file.
@@ -133,9 +138,12 @@ def import_torch(
     if isinstance(module, str | os.PathLike) and _is_torchscript(module):
         raise ValueError(f"'{os.fspath(module)}' is a file of TorchScript, {_SCRIPT.format(f'torch.jit.load({os.fspath(module)!r})')}")
     _live(module, "import_torch", "torch.load")
-    if type(module).__name__ == "OptimizedModule" and hasattr(module, "actor"):
+    if type(module).__name__ == "OptimizedModule" and _core(module):
         module = module._orig_mod  # as torch.compile wraps it
-    network = [("actor", module.actor)] if hasattr(module, "actor") else [("", module)]
+    core = _core(module)
+    if getattr(module, "is_recurrent", False) is True:
+        raise ValueError(f"module {type(module).__name__} is recurrent, which is none that layers consist of; train one without memory, or give it history")
+    network = [(core, getattr(module, core))] if core else [("", module)]
     _check_order(*network[0])
     layers = _layers(network)
     if not layers:
@@ -441,16 +449,35 @@ def _range_of(output_clip: Any, n: int) -> tuple[Any, Any]:
     return low if low.shape else float(low), high if high.shape else float(high)
 
 
+def _core(module: Any) -> str:
+    """Name of the part of a module that is its network: its actor, or the mlp of a model of rsl_rl; empty where it is the network."""
+    if hasattr(module, "actor"):
+        return "actor"
+    return "mlp" if _is_model(module) else ""
+
+
+def _is_model(module: Any) -> bool:
+    """Whether it is a model of rsl_rl, itself or as it exports it (as_onnx, as_jit): a normaliser, or an Identity in its place, and the network."""
+    return hasattr(module, "obs_normalizer") and hasattr(module, "mlp")
+
+
+def _export(module: Any, name: str = "module") -> str:
+    """What works in the place of a module that is not read; a model of rsl_rl takes no tensor, and what it makes of itself for that does."""
+    if not hasattr(module, "as_onnx"):
+        return _EXPORT
+    return _EXPORT.replace("(module,", f"({name}.as_onnx(False),").replace("'policy.onnx')", "'policy.onnx', dynamo=False)")
+
+
 def _beside(module: Any) -> dict[str, Any]:
     """What a module holds beside its actor, by name: parts, tensors and other objects, but no settings."""
-    held = dict(getattr(module, "__dict__", {}))
+    core, held = _core(module), dict(getattr(module, "__dict__", {}))
     for table in ("_parameters", "_buffers", "_modules"):
         held |= held.pop(table, None) or {}
     held |= dict(getattr(module, "named_children", dict)())
     return {
         name: of
         for name, of in held.items()
-        if of is not module.actor
+        if of is not getattr(module, core)
         and not (of is None or isinstance(of, bool | int | float | str | type) or type(of).__name__ == "Identity")
         and not (isinstance(of, Mapping) and "mean" not in of)
     }
@@ -464,8 +491,8 @@ def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
     if not found:
         return None, None
     name, normaliser = next(iter(found.items()))
-    kind, ways = type(normaliser).__name__, f"give mean= and std= where it computes (observation - mean) / std; else {_EXPORT}"
-    said = f"module {type(module).__name__} has {name} ({kind}) beside its actor"
+    kind, ways = type(normaliser).__name__, f"give mean= and std= where it computes (observation - mean) / std; else {_export(module)}"
+    said = f"module {type(module).__name__} has {name} ({kind}) beside its {_core(module)}"
     if len(found) > 1:
         raise ValueError(f"{said}, and {', '.join(list(found)[1:])}, of which nobody knows which one is meant; {ways}")
     _check_hooks(name, normaliser)
@@ -515,10 +542,10 @@ def _of_batches(name: str, norm: Any) -> tuple[np.ndarray, np.ndarray]:
 def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequence[Policy], rounding: float) -> None:
     """Holds what a module itself gives against what was ``read`` of it, of which the first is imported and the others lack what may stand around the module.
     One that has nothing to run may have nothing beside its actor that nobody knows. `rounding` is the part that the precision of what was read loses."""
-    has_actor = hasattr(module, "actor")
-    kind, of = type(module).__name__, "module.actor" if has_actor else "its layers"
-    around = "give nearl.import_torch(module.actor), with mean=, std=, clip= and output_clip= for what stands around it"
-    give = f"where the actor is all of the policy, {around}; else {_EXPORT}" if has_actor else _EXPORT
+    core = _core(module)
+    kind, of = type(module).__name__, f"module.{core}" if core else "its layers"
+    around = f"give nearl.import_torch({of}), with mean=, std=, clip= and output_clip= for what stands around it"
+    give = f"where the {core} is all of the policy, {around}; else {_export(module)}" if core else _EXPORT
     part = max(_SAME_PART, rounding)
     for way, function in _ways(module):
         if way == "forward" and _lacks_forward(module):
@@ -551,23 +578,23 @@ def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequen
             f"module {kind} does more than {of}: its {way} gives {given[row][i, k]:.4g} as output[{k}] where the layers that are read give "
             f"{wanted[row][i, k]:.4g}, off by {off[i, k]:.3g} on the same observation; {give}"
         )
-    if has_actor:
-        _check_apart(module, give)
+    if core:
+        _check_apart(module, core, give)
 
 
-def _check_apart(module: Any, give: str) -> None:
+def _check_apart(module: Any, core: str, give: str) -> None:
     """Refuses parts, tensors and functions beside an actor that may have a part in the action, where the module cannot be asked."""
     functions = {name: getattr(type(module), name, None) for name in dir(type(module))} | getattr(module, "__dict__", {})
     if acts := sorted(name for name, of in functions.items() if inspect.isroutine(of) and _ACTS.search(name)):
         said = f"its own {', '.join(acts)} {'is' if len(acts) == 1 else 'are'} not read"
         raise ValueError(
-            f"module {type(module).__name__} has neither forward nor act_inference, and {said}, so nobody knows whether the action is what module.actor gives; "
-            f"{give}"
+            f"module {type(module).__name__} has neither forward nor act_inference, and {said}, so nobody knows whether the action is what module.{core} "
+            f"gives; {give}"
         )
     for name, of in _beside(module).items():
         is_part = any(hasattr(of, what) for what in ("named_children", "forward", "detach")) or isinstance(of, np.ndarray)
         if is_part and not _APART.search(name) and not _is_normaliser(name, of):
-            said = f"module {type(module).__name__} has {name} ({type(of).__name__}) beside its actor"
+            said = f"module {type(module).__name__} has {name} ({type(of).__name__}) beside its {core}"
             raise ValueError(f"{said}, and no forward that tells whether the action depends on it; {give}")
 
 
@@ -614,7 +641,7 @@ def _ran(module: Any, function: Callable[[Any], Any], obs: np.ndarray, shape: tu
     """What a function of a module saw (n x n_in), and what it gave twice (n x shape)."""
     with _acting(module) as tensor:
         groups = getattr(module, "obs_groups", None)
-        names = next((groups[name] for name in ("policy", "actor") if name in groups), None) if isinstance(groups, Mapping) else None
+        names = next((groups[name] for name in ("policy", "actor") if name in groups), None) if isinstance(groups, Mapping) else groups
         given = []
         for _ in range(2):
             asked = tensor(obs)  # anew, as it may be changed in its place
@@ -657,7 +684,7 @@ def _acting(module: Any) -> Iterator[Callable[[np.ndarray], Any]]:
         return
     parts = [(part, dict(vars(part)), dict(part._buffers)) for part in dict.fromkeys(part for of in modules for part in of.modules())]
     tensors = [(of, of.detach().clone()) for part, _, _ in parts for of in (*part._parameters.values(), *part._buffers.values()) if of is not None]
-    actor = getattr(module, "actor", None)
+    actor = getattr(module, _core(module) or "actor", None)
     of_actor = list(actor.parameters()) if isinstance(actor, torch.nn.Module) else []  # what is beside it may have another precision
     like = next((of for of in (*of_actor, *(of for of, _ in tensors)) if of.is_floating_point()), torch.zeros(1))
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
@@ -715,6 +742,12 @@ def _check_order(name: str, module: Any) -> None:
         kind = type(part).__name__
         if kind.endswith("ScriptModule") or kind == "TopLevelTracedModule":
             raise ValueError(f"module {getattr(part, 'original_name', kind)} is TorchScript ({kind}), {_SCRIPT.format('module')}")
+        if at and _is_model(part):
+            whole = f"module.{at}"
+            raise ValueError(
+                f"{whole} ({kind}) has a normaliser of its own, and nobody knows what else stands around it; where it is all of the policy, give "
+                f"nearl.import_torch({whole}); else {_export(part, whole)}"
+            )
         parts = list(getattr(part, "named_children", lambda: ())())
         if not parts:
             continue

@@ -426,7 +426,24 @@ def test_the_metadata_of_mjlab_is_a_recipe(tmp_path) -> None:
     assert controller.obs_names[-3:] == ["command.lin_vel_x", "command.lin_vel_y", "command.ang_vel_z"]
     helper.set_model_props(model, said | {"observation_names": "joint_pos,height_scan"})
     onnx.save(model, path)
-    with pytest.raises(ValueError, match="metadata 'observation_names': term 'height_scan' is none"):
+    with pytest.raises(ValueError, match="policy.onnx': metadata 'observation_names': term 'height_scan' is none"):
+        nearl.import_onnx(path, **files)
+    # As mjlab 1.6.0 writes them: a scale for each entry, a clip for each term; both had been left out or refused.
+    more = {
+        "observation_terms_scale": "1.000,0.500;2.000;3.000,1.000,2.000;4.000;0.250",
+        "observation_terms_clip": "-0.500;0.500,-inf;inf,-inf;inf,-inf;0.700",
+        "observation_terms_history_length": "0,0,0,0",
+    }
+    helper.set_model_props(model, said | more)
+    onnx.save(model, path)
+    weight, bias = (numpy_helper.to_array(of).astype(float) for of in model.graph.initializer)
+    controller, (q, v, command) = nearl.import_onnx(path, **files), RNG.normal(size=(3, 3))
+    seen = np.concatenate([np.clip(q - [0.1, 0.2, 0.3], -0.5, 0.5), [0.5, 2, 3] * v, np.zeros(3), [2, 4, 0.25] * np.minimum(command, 0.7)])
+    action, _ = controller.update(q, v, np.concatenate([q, v, command]))
+    np.testing.assert_allclose(action, 0.5 * (seen @ weight + bias), rtol=1e-5, atol=1e-5)
+    helper.set_model_props(model, said | more | {"observation_terms_scale": "1.000,0.500"})
+    onnx.save(model, path)
+    with pytest.raises(ValueError, match="policy.onnx': metadata 'observation_terms_scale': '1.000,0.500' has 2 entries for the 4 terms"):
         nearl.import_onnx(path, **files)
 
 
@@ -1131,6 +1148,75 @@ def test_a_module_that_does_more_than_its_actor_is_refused(tmp_path) -> None:
     grouped = Actor(obs_groups={"policy": ["a", "b"]})
     grouped.act_inference = lambda groups: np.stack([grouped.actor(x) for x in np.hstack([groups["a"], groups["b"]])])
     nearl.import_torch(grouped, **files)
+
+
+class Model:
+    """As rsl_rl 5.4.2 has them: it takes a dict of groups, joins them, normalises what comes out and runs its mlp."""
+
+    is_recurrent = False
+
+    def __init__(self, norm, factor: float = 1.0) -> None:
+        self.obs_normalizer, self.mlp, self.factor = norm, Sequential([Linear(14, 9), Tanh(), Linear(9, 3)]), factor
+        self.obs_groups, self.distribution = ["policy", "heights"], SimpleNamespace(std=np.ones(3))
+
+    def forward(self, obs):
+        rows = np.hstack([obs[group] for group in self.obs_groups])
+        return np.stack([self.factor * self.mlp(x) for x in self.obs_normalizer.forward(rows)])
+
+    def as_onnx(self, verbose): ...
+
+
+def exported(controller, tmp_path):
+    """What `nearl export` makes of it, as a function of an observation."""
+    controller.save(tmp_path / "p.safetensors")
+    subprocess.run([NEARL, "export", tmp_path / "p.safetensors", "--out", tmp_path / "p.onnx"], check=True)
+    session = onnxruntime.InferenceSession(tmp_path / "p.onnx")
+    return lambda obs: session.run(None, {"obs": f32(obs)[None]})[0][0]
+
+
+def test_models_of_rsl_rl_are_read_with_their_normaliser(tmp_path) -> None:
+    """They were refused, with the advice to export what takes no tensor."""
+    files, same = planar(tmp_path), type("Identity", (), {"forward": lambda self, x: x})()
+    for norm in (EmpiricalNormalization(), same):
+        model = Model(norm)
+        policy = exported(nearl.import_torch(model, **files), tmp_path)
+        for obs in 2 * RNG.normal(size=(20, 14)):
+            np.testing.assert_allclose(policy(obs), model.mlp(norm.forward(obs).ravel()), rtol=1e-5, atol=2e-5)
+    export = r"export it, torch.onnx.export\({}.as_onnx\(False\), \(torch.zeros\(1, n\),\), 'policy.onnx', dynamo=False\) with n inputs"
+    recurrent = Model(same)
+    recurrent.is_recurrent = True
+    for model, said in (
+        (Model(same, 0.9), "module Model does more than module.mlp: its forward gives .*; where the mlp is all .*" + export.format("module")),
+        (Model(Clamped()), r"obs_normalizer \(Clamped\) beside its mlp, which computes something else .*" + export.format("module")),
+        (recurrent, "module Model is recurrent, which is none that layers consist of; train one without memory"),
+        (
+            Actor(actor=Model(same)),
+            r"module.actor \(Model\) has a normaliser .* give nearl.import_torch\(module.actor\); else " + export.format("module.actor"),
+        ),
+    ):
+        with pytest.raises(ValueError, match=said):
+            nearl.import_torch(model, **files)
+
+
+def test_a_model_of_rsl_rl_itself_gives_what_it_gives(tmp_path) -> None:
+    torch = pytest.importorskip("torch")
+    pytest.importorskip("tensordict")
+    models = pytest.importorskip("rsl_rl.models", exc_type=ImportError)
+    files, sizes = planar(tmp_path), {"policy": 10, "heights": 4}
+    see = lambda n: {name: 3 * torch.randn(n, size) + 1 for name, size in sizes.items()}  # noqa: E731
+    gaussian = {"class_name": "rsl_rl.modules.distribution:GaussianDistribution", "init_std": 1.0}
+    model = models.MLPModel(see(8), {"actor": list(sizes)}, "actor", 3, (9, 7), "elu", True, gaussian)
+    for _ in range(20):
+        model.update_normalization(see(16))
+    for module in (model, model.as_onnx(False), model.as_jit()):
+        policy = exported(nearl.import_torch(module, **files), tmp_path)
+        for _ in range(20):
+            obs = see(1)
+            with torch.no_grad():
+                want = model(obs).numpy()[0]
+            np.testing.assert_allclose(policy(torch.cat(list(obs.values()), 1).numpy()[0]), want, rtol=1e-5, atol=2e-5)
+    torch.onnx.export(model.as_onnx(False), (torch.zeros(1, 14),), tmp_path / "model.onnx", dynamo=False)
+    nearl.import_onnx(tmp_path / "model.onnx", **files)
 
 
 class Squashed:

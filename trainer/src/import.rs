@@ -113,9 +113,21 @@ pub enum ImportError {
     /// The graph as a whole is no policy.
     #[error("the graph is no policy: {0}")]
     Graph(String),
+    /// What is wrong with the graph of a file.
+    #[error("'{file}': {error}")]
+    In {
+        /// Path as given.
+        file: String,
+        /// What it is.
+        error: Box<ImportError>,
+    },
 }
 
 impl ImportError {
+    fn of(self, file: &str) -> Self {
+        Self::In { file: file.into(), error: Box::new(self.in_one_line()) }
+    }
+
     /// Names quoted from a file may hold line breaks and other signs that are not printed.
     fn in_one_line(self) -> Self {
         let plain = |text: String| text.replace(char::is_control, " ");

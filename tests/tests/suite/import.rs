@@ -1,9 +1,10 @@
 //! A policy goes out as ONNX and comes back; damaged files are refused and never break the program.
 
-use nearl_runtime::Controller;
+use nearl_runtime::net::{Dense, DenseLayer, Function};
+use nearl_runtime::{Controller, Snapshot};
 use nearl_tests::training;
 use nearl_trainer::export;
-use nearl_trainer::import::{Gives, ImportError, Setting, for_task, onnx};
+use nearl_trainer::import::{Gives, ImportError, ImportedNetwork, Setting, for_task, onnx};
 use rand::RngExt;
 
 const SHORT: [&str; 3] = ["train.n_envs=4", "train.n_steps=32", "train.ppo.batch_size=64"];
@@ -216,4 +217,207 @@ fn weights_that_are_none_are_named_in_the_file_they_come_from() {
         error.contains("'normaliser.std' has 1e13 at index 2, and no observation counts beyond 1e12"),
         "{error}"
     );
+}
+
+/// What mjlab 1.6.0 writes (`list_to_csv_str`): numbers of three decimals, `;` within an entry, a clip for each term, `base_lin_vel` of a velocimeter.
+const OF_MJLAB: [(&str, &str); 11] = [
+    ("joint_names", "hip,knee"),
+    ("joint_stiffness", "20.000,30.000"),
+    ("joint_damping", "1.000,2.000"),
+    ("default_joint_pos", "0.100,-0.200"),
+    ("action_scale", "0.500,0.250"),
+    ("command_names", "twist"),
+    ("observation_names", "base_lin_vel,base_ang_vel,projected_gravity,joint_pos,joint_vel,actions,command"),
+    ("observation_terms_scale", "2.000,0.250;0.250;0.100,1.000,1.000,0.050,1.000,2.000;3.000;0.250"),
+    ("observation_terms_clip", "-inf;inf,-inf;0.500,-inf;inf,-0.500;0.500,-inf;inf,-inf;inf,-inf;inf"),
+    ("observation_terms_history_length", "0,0,0,0,3,0,0"),
+    ("observation_terms_flatten_history_dim", "1.000,1.000,1.000,1.000,1.000,1.000,1.000"),
+];
+
+const SENSORS: &str =
+    r#"<sensor><gyro name="imu_ang_vel" site="imu"/><velocimeter site='imu' name = "imu_lin_vel"/></sensor>"#;
+
+/// A base that floats, with two joints; `imu` are the attributes of a site on it.
+fn floating(imu: &str, sensors: &str) -> String {
+    let inertial = "<inertial pos='0 0 0' mass='1' diaginertia='.1 .1 .1'/>";
+    format!(
+        "<mujoco><worldbody><body name='base' pos='0 0 1'><freejoint/>{inertial}<site name='imu' {imu}/>
+        <body name='thigh'><joint name='hip' axis='0 1 0' range='-2 2' limited='true'/>{inertial}
+        <body name='shank' pos='0 0 -.3'><joint name='knee' axis='0 1 0' range='-2 2' limited='true'/>{inertial}
+        <site name='toe'/></body></body></body></worldbody>
+        <actuator><position joint='hip' kp='20' kv='1' ctrlrange='-3 3' forcerange='-50 50'/>
+        <position joint='knee' kp='30' kv='2' ctrlrange='-3 3' forcerange='-50 50'/></actuator>
+        <!-- <velocimeter name='imu_lin_vel' site='toe'/> -->{sensors}</mujoco>"
+    )
+}
+
+/// The policy with mjlab's metadata and what `other` says in its place, on a robot, by a recipe.
+fn of_mjlab(other: &[(&str, &str)], robot: &str, recipe: &str) -> Result<Snapshot, String> {
+    const N: usize = 22;
+    let folder = tempfile::tempdir().expect("folder");
+    let files = ["robot.xml", "recipe.toml"].map(|name| folder.path().join(name));
+    std::fs::write(&files[0], robot).expect("robot");
+    std::fs::write(&files[1], recipe).expect("recipe");
+    let layer = DenseLayer { n_in: N, n_out: 2, weight: vec![0.1; 2 * N], bias: vec![0.0; 2] };
+    let pairs = OF_MJLAB.iter().chain(other).map(|(k, v)| ((*k).to_string(), (*v).to_string()));
+    let network = ImportedNetwork {
+        mean: vec![0.0; N],
+        std: vec![1.0; N],
+        clip: vec![[f64::NEG_INFINITY, f64::INFINITY]; N],
+        dense: Dense { layers: vec![layer], ..Dense::default() },
+        functions: vec![Function::Identity],
+        output: vec![[f64::NEG_INFINITY, f64::INFINITY]; 2],
+        input_name: "obs".into(),
+        output_name: "actions".into(),
+        metadata: pairs.collect(),
+    };
+    let setting = Setting { name: "legs", robot: &files[0], recipes: &files[1..] };
+    nearl_trainer::import::snapshot(&network, &setting).map_err(|e| e.to_string())
+}
+
+/// What the policy sees in one state that is not at rest.
+fn seen(snapshot: &Snapshot) -> Vec<f64> {
+    let mut controller = Controller::new(snapshot).expect("controller");
+    let (mut state, mut out) = (controller.state(), controller.output());
+    state.q.copy_from_slice(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.9, 0.1]);
+    state.v.copy_from_slice(&[0.4, -0.3, 0.2, 1.0, 2.0, 3.0, 5.0, -7.0]);
+    let n = state.obs.len();
+    state.obs[n - 3..].copy_from_slice(&[0.5, -0.25, 0.75]);
+    controller.update(&state, &controller.noise(), &mut out);
+    out.x.iter().map(|x| f64::from(*x)).collect()
+}
+
+/// In that state by hand. Linear: (0.4, -0.3, 0.2) + (1, 2, 3) x (0.1, -0.2, 0.3) = (1.6, -0.3, -0.2), and twice that.
+const SEEN: [f64; 22] = [
+    3.2, -0.6, -0.4, // base_lin_vel of the site
+    0.125, 0.125, 0.05, // 1, 2 and 3 are cut to 0.5
+    0.0, 0.0, -1.0, //
+    0.5, 0.3, // 0.8 is cut to 0.5
+    0.25, -0.35, 0.25, -0.35, 0.25, -0.35, // three ticks
+    0.0, 0.0, //
+    1.0, -0.75, 0.1875, // a scale for each
+];
+
+fn assert_seen(snapshot: Result<Snapshot, String>, want: &[f64]) {
+    let found = seen(&snapshot.unwrap_or_else(|e| panic!("{e}")));
+    let near = |(a, b): (&f64, &f64)| (a - b).abs() < 1e-6;
+    assert!(found.len() == want.len() && found.iter().zip(want).all(near), "{found:?}, not {want:?}");
+}
+
+const IMU: &str = "pos='0.1 -0.2 0.3'";
+const PERIOD: &str = "[time]\ndt = 0.02\n";
+
+/// A scale for each entry, and every clip, had been left out or refused.
+#[test]
+fn terms_of_mjlab_have_their_scales_clips_and_histories() {
+    let robot = floating(IMU, SENSORS);
+    assert_seen(of_mjlab(&[], &robot, PERIOD), &SEEN);
+    // Before 1.6: no scale and no clip are None.
+    let old = [
+        ("observation_terms_scale", "2.0,None,None,1.0,0.05,None,None"),
+        ("observation_terms_clip", "None,None,None,None,None,None,None"),
+        ("observation_terms_flatten_history_dim", "True,True,True,True,True,True,True"),
+    ];
+    let mut want = SEEN;
+    want[3..6].copy_from_slice(&[1.0, 2.0, 3.0]);
+    want[9] = 0.8;
+    want[19..].copy_from_slice(&[0.5, -0.25, 0.75]);
+    assert_seen(of_mjlab(&old, &robot, PERIOD), &want);
+}
+
+/// They had been left out without a word, and the policy saw other numbers.
+#[test]
+fn terms_of_mjlab_that_cannot_be_read_are_refused_by_key() {
+    let robot = floating(IMU, SENSORS);
+    for (key, value, said) in [
+        ("scale", "2.000,0.250", "has 2 entries for the 7 terms of observation_names"),
+        ("scale", "2.0,0.2;x;0.1,1,1,1,1,1", "entry 2 (term 'base_ang_vel') is '0.2;x;0.1', no number"),
+        ("scale", "nan,1,1,1,1,1,1", "entry 1 (term 'base_lin_vel') is 'nan', no number"),
+        ("scale", "1,1,1,1;1;1,1,1,1", "entry 4 has 3 numbers for the 2 entries of term 'joint_pos'"),
+        ("scale", "1,1,1,1,1,1,1;1", "entry 7 has 2 numbers for the 3 entries of term 'command'"),
+        ("clip", "(-1.0, 1.0),None,None,None,None,None,None", "has 8 entries for the 7 terms"),
+        (
+            "clip",
+            "-inf;inf,1,None,None,None,None,None",
+            "entry 2 (term 'base_ang_vel') is '1', where the lowest",
+        ),
+        ("clip", "1;-1,None,None,None,None,None,None", "entry 1 (term 'base_lin_vel') is '1;-1', where"),
+        ("clip", "nan;1,None,None,None,None,None,None", "entry 1 (term 'base_lin_vel') is 'nan;1', where"),
+        ("history_length", "0,0,0,x,3,0,0", "entry 4 (term 'joint_pos') is 'x', no number of ticks"),
+        ("history_length", "0,0,0,-1,3,0,0", "entry 4 (term 'joint_pos') is '-1', no number of ticks"),
+        ("history_length", "0,0,0,1e9,3,0,0", "entry 4 (term 'joint_pos') is '1e9', no number of ticks"),
+        ("history_length", "3", "'3' has 1 entries for the 7 terms"),
+        ("flatten_history_dim", "1,1,1,1,False,1,1", "entry 5 (term 'joint_vel') is 'False', and a history"),
+    ] {
+        let key = format!("observation_terms_{key}");
+        let error = of_mjlab(&[(&key, value)], &robot, PERIOD).expect_err(value);
+        assert!(error.starts_with(&format!("metadata '{key}': ")) && error.contains(said), "{error}");
+        assert!(error.contains("; state all of policy.observation in a recipe (--recipe FILE"), "{error}");
+    }
+    let error = of_mjlab(&[("default_joint_pos", "nan,0")], &robot, PERIOD).expect_err("no pose");
+    assert_eq!(error, "metadata 'default_joint_pos': 'nan,0' is no list of numbers; export the policy again");
+}
+
+/// As the messages say.
+#[test]
+fn terms_of_mjlab_are_not_looked_at_where_a_recipe_states_them() {
+    let recipe = r#"[policy]
+        observation = [{ term = "constant", value = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0, 16.0] },
+                       { term = "base_lin_vel" }, { term = "command", entries = ["command.a", "command.b", "command.c"] }]"#;
+    let want: Vec<f64> = (1..=16).map(f64::from).chain([0.4, -0.3, 0.2, 0.5, -0.25, 0.75]).collect();
+    for (key, value) in [
+        ("observation_terms_clip", "1;-1"),
+        ("observation_terms_scale", "x"),
+        ("observation_terms_history_length", "x"),
+        ("observation_names", "base_lin_vel,height_scan"),
+    ] {
+        let robot = floating(IMU, SENSORS);
+        assert_seen(of_mjlab(&[(key, value)], &robot, &format!("{PERIOD}{recipe}")), &want);
+    }
+}
+
+/// mjlab's is of a velocimeter, which the origin of the base had been taken for.
+#[test]
+fn the_velocity_of_the_base_is_that_of_the_velocimeter_in_the_robot_file() {
+    let of = |sensors: &str, imu: &str| of_mjlab(&[], &floating(imu, sensors), PERIOD);
+    let sensor =
+        |name: &str, site: &str| format!("<sensor><velocimeter name='{name}' site='{site}'/></sensor>");
+    assert_seen(of(&sensor("other", "imu"), IMU), &SEEN);
+    let two = format!("{SENSORS}{}", sensor("foot", "toe"));
+    assert_seen(of(&two, IMU), &SEEN);
+    let mut at_origin = SEEN;
+    at_origin[..3].copy_from_slice(&[0.8, -0.6, 0.4]);
+    assert_seen(of(SENSORS, "pos='0 0 0'"), &at_origin);
+    let notes =
+        |snapshot: &Snapshot| nearl_runtime::doctor::told(&snapshot.manifest).expect("notes").join("\n");
+    let said = "does not say where on the base its base_lin_vel was measured, and ";
+    for (sensors, is_told) in [("", true), (&sensor("foot", "toe"), true), (SENSORS, false)] {
+        let made = of(sensors, "pos='0 0 0'").expect("imports");
+        assert_eq!(notes(&made).contains(said), is_told, "{}", notes(&made));
+        assert_seen(Ok(made), &at_origin);
+    }
+    for (sensors, imu, said) in [
+        (
+            SENSORS,
+            "pos='0.1 0 0' euler='0 0 90'",
+            "robot.xml: the velocimeter at site 'imu' is turned against the base",
+        ),
+        (
+            &sensor("imu_lin_vel", "toe"),
+            IMU,
+            "the velocimeter 'imu_lin_vel' is at site 'toe', which is not on the base",
+        ),
+    ] {
+        let error = of(sensors, imu).expect_err("no term");
+        assert!(
+            error.contains(said) && error.contains("; state all of policy.observation in a recipe"),
+            "{error}"
+        );
+    }
+    // A policy that does not see it, and one whose recipe says what it sees, have nothing to be told.
+    let blind = [(
+        "observation_names",
+        "base_ang_vel,projected_gravity,base_ang_vel,joint_pos,joint_vel,actions,command",
+    )];
+    assert!(!notes(&of_mjlab(&blind, &floating(IMU, ""), PERIOD).expect("imports")).contains(said));
 }

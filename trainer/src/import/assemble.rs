@@ -39,11 +39,15 @@ pub struct Setting<'a> {
 /// # Errors
 /// [`ImportError`]: what is missing, or what does not fit.
 pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snapshot, ImportError> {
-    let mut table = metadata::recipe(network)?;
     let mut files = vec![("the policy's metadata".to_string(), String::new())];
+    let mut stated = Vec::new();
     for path in setting.recipes {
         let (over, text) = said(path, setting.robot)?;
         files.push((path.display().to_string(), text));
+        stated.push(over);
+    }
+    let mut table = metadata::recipe(network, &stated)?;
+    for over in stated.iter().cloned() {
         // joints that are sent forces have no use for the gains that another file says
         if over.get("command").and_then(|c| c.get("interface")).and_then(Value::as_str) == Some("effort") {
             table.remove("command");
@@ -78,8 +82,11 @@ pub fn snapshot(network: &ImportedNetwork, setting: &Setting<'_>) -> Result<Snap
         }
     };
     let reset = table.get("reset").and_then(Value::as_table).cloned().unwrap_or_default();
-    let robot =
+    let mut robot =
         describe_in_task(&simulation, free, add.as_ref(), &reset).map_err(|e| unusable(setting.robot, &e))?;
+    let file = setting.robot.display().to_string();
+    let placed = metadata::place(&mut table, (network, &stated), (&file, &simulation.text, &robot))?;
+    robot.notes.extend(placed);
     let unusable = |e: &dyn std::fmt::Display| unusable(setting.robot, e);
     let model = Model::from_description(robot.clone()).map_err(|e| unusable(&e))?;
     state(&mut table, &model, &files)?;

@@ -47,7 +47,7 @@ pub fn onnx(
     }
     let model = ModelProto::parse_buf(bytes).map_err(|_| other(file, None))?;
     let graph = model.graph.as_ref().filter(|g| !g.node.is_empty()).ok_or_else(|| other(file, None))?;
-    let mut network = Graph::new(graph, beside).policy(output).map_err(ImportError::in_one_line)?;
+    let mut network = Graph::new(graph, beside).policy(output).map_err(|e| e.of(file))?;
     check_values(file, graph, beside, &network)?;
     let pairs = model.metadata_props.iter();
     network.metadata =
