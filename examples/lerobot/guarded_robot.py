@@ -16,9 +16,13 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from lerobot.robots import Robot, RobotConfig
 
 import nearl
+
+try:
+    from lerobot.robots import Robot, RobotConfig
+except ImportError as error:
+    raise SystemExit(f"guarded_robot.py needs LeRobot, but {error}: pip install lerobot==0.4.4") from None
 
 
 @RobotConfig.register_subclass("nearl_guarded")

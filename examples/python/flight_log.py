@@ -6,7 +6,10 @@ import subprocess
 import sys
 from collections import Counter
 
-from mcap.reader import make_reader
+try:
+    from mcap.reader import make_reader
+except ImportError as error:
+    raise SystemExit(f"flight_log.py needs mcap, but {error}: pip install mcap") from None
 
 file = sys.argv[1] if len(sys.argv) > 1 else "runs/arm.mcap"
 nearl = [sys.executable, "-m", "nearl"]

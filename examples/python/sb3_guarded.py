@@ -39,13 +39,16 @@ def run(env: gymnasium.Env, act, episodes: int) -> tuple[float, int]:
 
 
 def main(algorithm: str = "random", robot: str = "arm", steps: str = "0") -> None:
+    if algorithm != "random":
+        try:
+            import stable_baselines3
+        except ImportError as error:
+            raise SystemExit(f"sb3_guarded.py needs Stable-Baselines3, but {error}: pip install stable-baselines3==2.9.2") from None
     env = make(robot)
     mean, broken = run(env, lambda obs: env.action_space.sample(), 3)
     print(f"random actions on {robot}: return {mean:.1f}, {broken} ticks outside the limits")
     if algorithm == "random":
         return
-    import stable_baselines3
-
     learner = {"sac": stable_baselines3.SAC, "ppo": stable_baselines3.PPO}[algorithm]
     model = learner("MlpPolicy", env, seed=0, device="cpu").learn(int(steps))
     mean, broken = run(env, lambda obs: model.predict(obs, deterministic=True)[0], 3)

@@ -4,10 +4,14 @@ Needs `pip install stable-baselines3==2.9.2`."""
 import sys
 
 import numpy as np
-from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
 
 import nearl
+
+try:
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs, VecEnvStepReturn
+except ImportError as error:
+    raise SystemExit(f"sb3_vec_env.py needs Stable-Baselines3, but {error}: pip install stable-baselines3==2.9.2") from None
 
 
 class NearlVecEnv(VecEnv):

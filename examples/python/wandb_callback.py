@@ -3,9 +3,12 @@
 import sys
 from pathlib import Path
 
-import wandb
-
 import nearl
+
+try:
+    import wandb
+except ImportError as error:
+    raise SystemExit(f"wandb_callback.py needs Weights & Biases, but {error}: pip install wandb") from None
 
 folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/wandb")
 folder.mkdir(parents=True, exist_ok=True)

@@ -16,13 +16,18 @@ import sys
 import time
 
 import numpy as np
-import rclpy
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
 
 import nearl
+
+try:
+    import rclpy
+    from rclpy.node import Node
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from sensor_msgs.msg import JointState
+    from std_msgs.msg import Float64MultiArray
+except ImportError as error:
+    packages = "ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp ros-rmw-implementation ros-fastdds ros-sensor-msgs"
+    raise SystemExit(f"bridge.py needs ROS 2, but {error}: pip install {packages}, or source the system's") from None
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 

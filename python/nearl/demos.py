@@ -121,6 +121,7 @@ def from_columns(
         )
     if actions and (isinstance(actions, str) or len(actions) != len(env.actuator_names)):
         raise BadDemonstrations(f"{source}: actions is {actions!r}; give one column for each actuator, {', '.join(env.actuator_names)}")
+    _check_once(actions, env, source)
     parts: dict[str, list[Floats]] = {name: [] for name in ("observations", "qpos", "qvel", "actions")}
     lengths: list[int] = []
     told: set[str] = set()
@@ -265,6 +266,8 @@ def from_robomimic(
     check_entries(pairs, source)
     columns = {**{unbraced(name): of for name, of in columns.items()}, **pairs}
     acted = actions if isinstance(actions, str) else [of if isinstance(of, str) else f"actions[{i}]" for i, of in enumerate(actions)]
+    if pairs:
+        _check_once(actions, _core.Env(task_of(task)), source)
     regular(file, "the HDF5 file that robomimic wrote")
     episodes = []
     try:
@@ -363,6 +366,7 @@ def from_lerobot(
         if isinstance(actions, str) or (unknown := [name for name in actions if name not in of_action]):
             said = actions if isinstance(actions, str) else unknown[0]
             raise BadDemonstrations(f"{source}: actions has '{said}', which is no entry of 'action'; give a list of {', '.join(of_action)}")
+        _check_once(actions, env, source)
         # of its own, because a target is often called as the position is
         columns |= {f"action of {name}": acted[:, of_action.index(name)] for name in actions}
         actions = [f"action of {name}" for name in actions]
@@ -419,6 +423,13 @@ def from_motion(
             pose += list(of[:, 0].T)
         columns |= {f"q.{base}.{entry}": of for entry, of in zip(_BASE_Q, pose)}
     return from_columns(task, [columns], out, dt=seconds_between(clip["fps"], source), period=period, overwrite=overwrite, source=source)
+
+
+def _check_once(actions: Sequence[str | tuple[str, int]], env: _core.Env, source: str) -> None:
+    """Refuses a column that is to be the action of two actuators."""
+    for k, name in enumerate(actions):
+        if name in actions[:k]:
+            raise BadDemonstrations(f"{source}: actions has {name!r} twice; give one column for each actuator, {', '.join(env.actuator_names)}")
 
 
 def _known(env: _core.Env) -> set[str]:

@@ -2,6 +2,7 @@
 
 import os
 import re
+import sys
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from difflib import get_close_matches
@@ -111,6 +112,14 @@ def _letters(name: object) -> str:
     return re.sub(r"[^a-z0-9]", "", str(name).lower())
 
 
+def warn(message: str) -> None:
+    """Warns at the line that called this package, however many functions of it there are between."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "nearl":
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, stacklevel=level)
+
+
 def check_others(columns: Columns, used: Collection[str], n: int, dt: float, where: str, told: set[str]) -> None:
     """Holds the columns (n) that are not ``used`` against what else is known: one episode, whose rows are ``dt`` apart. Of the rest it warns, once each."""
     left = []
@@ -138,7 +147,7 @@ def check_others(columns: Columns, used: Collection[str], n: int, dt: float, whe
         said.append(f"'{name}'" + (f" (is '{free[near[0]]}' meant?)" if near else ""))
     are = ("column", "is") if len(said) == 1 else ("columns", "are")
     none = "it is no position, velocity or observation of the task" if len(said) == 1 else "they are no positions, velocities or observations of the task"
-    warnings.warn(f"{where}: {are[0]} {', '.join(said)} {are[1]} not used: {none}, and not in actions=", stacklevel=3)
+    warn(f"{where}: {are[0]} {', '.join(said)} {are[1]} not used: {none}, and not in actions=")
 
 
 def _check_times(columns: Columns, name: str, n: int, dt: float, where: str) -> None:
@@ -212,21 +221,19 @@ def check_units(
             continue
         row = int(np.argmax(np.abs(qvel[:, k])))
         if (speed := abs(qvel[row, k])) > _FAST * limit > 0:
-            warnings.warn(
+            warn(
                 f"{where}: joint '{joint}' moves at {speed:.3g} rad/s or m/s in row {row}, {speed / limit:.0f} times the task's limit of {limit:.3g}; "
                 f"look whether its columns are in rad or m, and dt in seconds",
-                stacklevel=3,
             )
 
 
 def _warn_of_range(joint: str, value: float, row: int, limits: tuple[float, float], positions: Floats, where: str) -> None:
     lower, upper = limits
     share = np.mean((positions < lower) | (positions > upper))
-    warnings.warn(
+    warn(
         f"{where}: column 'q.{joint}' is {value:.4g} in row {row}, and the task lets joint '{joint}' be at {lower:.3g} to {upper:.3g} rad or m (its range less "
         f"constraints.position.margin); {100 * share:.3g} % of the rows are outside. Look whether these are degrees, millimetres or shares of an opening (0 to "
         f"1), and whether the column is of another joint or counts from another zero; if it is right, give the joint that room in the robot file or the task",
-        stacklevel=4,
     )
 
 
@@ -251,10 +258,9 @@ def _warn_of_jump(joint: str, positions: Floats, row: int, back: bool, dt: float
         reason = f"look whether the measurement of row {row + 1} was lost, and put one between those beside in its place"
     else:
         reason = "look whether rows are missing there, or another episode begins (in CSV a column 'episode')"
-    warnings.warn(
+    warn(
         f"{where}: joint '{joint}' jumps from {a:.4g} in row {row} to {b:.4g} in the next{returns}, {abs(b - a) / dt:.3g} rad/s or m/s with dt = {dt:g} s, "
         f"where the task's limit is {limit:.3g}; {reason}",
-        stacklevel=4,
     )
 
 
@@ -283,10 +289,9 @@ def check_velocities(columns: Columns, names: Sequence[str], qvel: Floats, rates
     also = f" (likewise {', '.join(name for _, name in wrong[1:])})" if wrong[1:] else ""
     of_time = None not in factors and len(factors) > 1 and max(factors) < 1.1 * min(factors)  # type: ignore[type-var, operator]
     fits = f" (rows about {dt / float(np.median(factors)):.2g} s apart would fit, and dt is {dt:g} s)" if of_time else ""  # type: ignore[arg-type]
-    warnings.warn(
+    warn(
         f"{where}: {wrong[0][0]}, and is as far off in half of the rows{also}; look at sign, unit and dt{fits}, or leave velocities out: then they are the "
         "differences of the positions",
-        stacklevel=3,
     )
 
 
@@ -433,10 +438,9 @@ def _check_observed(columns: Mapping[str, Floats], rows: Rows, computed: Mapping
             wrong.append((f"{said}, and {100 * np.mean(off):.3g} % of the rows are as far off", name))
     if wrong:
         also = f" (likewise {', '.join(name for _, name in wrong[1:])})" if wrong[1:] else ""
-        warnings.warn(
+        warn(
             f"{where}: {wrong[0][0]}{also}; what they give is written. Look whether the joints' columns have the right names and units, and whether the column "
             f"is of this robot's tool; if it alone is wrong, leave it out",
-            stacklevel=4,
         )
 
 

@@ -27,7 +27,7 @@ class Renderer:
         camera: A camera of the robot file; by default its ``track``, else one that follows the robot.
 
     Raises:
-        VideoError: no renderer here, or no such camera.
+        VideoError: no renderer here, no such camera, or a file that the robot file names and that cannot be read.
     """
 
     def __init__(self, env: _core.Env, size: tuple[int, int], camera: str | None = None):
@@ -45,10 +45,12 @@ class Renderer:
 
                 gl_context.GLContext = GLContext
             self._mujoco = mujoco
-            self._model = _compiled(mujoco, env)
+            self._model = compiled(mujoco, env)
             self._model.vis.global_.offwidth, self._model.vis.global_.offheight = size
             self._data = mujoco.MjData(self._model)
             self._renderer = mujoco.Renderer(self._model, size[1], size[0])
+        except VideoError:
+            raise
         except Exception as error:  # each missing library fails in its own way, from AttributeError to EGLError
             words = str(error).strip().splitlines() or [type(error).__name__]
             advice = "on Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri" if backend == "egl" else "try MUJOCO_GL=egl"
@@ -92,10 +94,25 @@ class Renderer:
                 scene.ngeom += 1
 
 
-def _compiled(mujoco: Any, env: _core.Env) -> Any:
-    """MuJoCo's model of the robot file; where the task lets a URDF's base float, with that joint and a floor."""
-    spec = mujoco.MjSpec.from_string(env.model_text)
-    model = spec.compile()
+def compiled(mujoco: Any, env: _core.Env) -> Any:
+    """MuJoCo's model of the robot file; where the task lets a URDF's base float, with that joint and a floor.
+
+    Raises:
+        VideoError: MuJoCo cannot read it, or a file that it names.
+    """
+    folder = None if env.model_folder is None else os.fspath(env.model_folder)
+    try:
+        return _compiled_in(mujoco, env, folder)
+    except ValueError as error:  # how MuJoCo refuses a file
+        words = " ".join(str(error).removeprefix("XML ").removeprefix("Error: ").split())
+        where = "" if folder is None else f" in '{folder}'"
+        is_missing = "opening file" in words
+        advice = f"put that file where the robot file{where} names it, or correct its name there" if is_missing else "correct the robot file"
+        raise VideoError(f"MuJoCo cannot read the robot file of '{env.task}' ({words}); {advice}") from error
+
+
+def _compiled_in(mujoco: Any, env: _core.Env, folder: str | None) -> Any:
+    model = _spec(mujoco, env.model_text, folder).compile()
     if (model.nq, model.nv) == (env.nq, env.nv):
         return model
     robot = ElementTree.fromstring(env.model_text)
@@ -105,7 +122,15 @@ def _compiled(mujoco: Any, env: _core.Env) -> Any:
     joint = ElementTree.SubElement(robot, "joint", name="root_joint", type="floating")
     ElementTree.SubElement(joint, "parent", link="world")
     ElementTree.SubElement(joint, "child", link=str(root))
-    spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+    spec = _spec(mujoco, ElementTree.tostring(robot, encoding="unicode"), folder)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], rgba=[0.6, 0.65, 0.7, 1.0])
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4] * 3, [0.7] * 3
     return spec.compile()
+
+
+def _spec(mujoco: Any, text: str, folder: str | None) -> Any:
+    """MuJoCo's reading of a text as if it stood in a file of ``folder``, from where it finds what the text includes, and meshes."""
+    if folder is None:
+        return mujoco.MjSpec.from_string(text)
+    file = os.path.join(folder, "nearl-robot.xml")  # of no disk; a text that is given goes before the file of its name
+    return mujoco.MjSpec.from_file(file, include={file: text.encode()})

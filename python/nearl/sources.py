@@ -115,7 +115,10 @@ def csv_table(file: FilePath) -> dict[str, Floats]:
     with open(file, newline="", encoding="utf-8-sig") as text:
         lines = csv.reader(text, skipinitialspace=True)
         try:
-            heading = _heading(next((row for row in lines if not (row and row[0].startswith("#"))), []), source)
+            commented: list[str] = []
+            while (first := next(lines, [])) and first[0].startswith("#"):
+                commented = first
+            heading = _heading(first, commented, source)
             for row in lines:
                 if (len(row) < 2 and not "".join(row).strip()) or row[0].startswith("#"):
                     continue
@@ -131,7 +134,8 @@ def csv_table(file: FilePath) -> dict[str, Floats]:
     return dict(zip(heading, np.frombuffer(values).reshape(-1, len(heading)).T))
 
 
-def _heading(cells: Sequence[str], source: str) -> list[str]:
+def _heading(cells: Sequence[str], commented: Sequence[str], source: str) -> list[str]:
+    """Names of the first line that is no comment; ``commented`` is the last comment above it."""
     names = [name.strip() for name in cells]
     if not any(names):
         raise BadDemonstrations(f"{source}: its first line is empty; begin with a heading, as q.<joint>,v.<joint>")
@@ -139,6 +143,9 @@ def _heading(cells: Sequence[str], source: str) -> list[str]:
         if len(names) == 1 and sign in names[0]:
             raise BadDemonstrations(f"{source}: its columns are separated by {what}; write commas between columns, and points in numbers")
     if all(_number(name) is not None for name in names):
+        meant = [name.strip() for name in ",".join(commented).lstrip("#").split(",")]
+        if len(meant) == len(names) and all(meant) and None in map(_number, meant):
+            raise BadDemonstrations(f"{source}: its heading begins with '#', '{commented[0]}'; save with comments='', or take the sign away")
         raise BadDemonstrations(f"{source}: its first line is numbers; begin with a heading, as q.<joint>,v.<joint>")
     once(names, source)
     return names
@@ -148,6 +155,8 @@ def _take(values: "array[float]", row: Sequence[str], heading: Sequence[str], wh
     if len(row) != len(heading):
         raise BadDemonstrations(f"{where}: {len(row)} cells below a heading of {len(heading)} columns; give one number for each column")
     try:
+        if "_" in "".join(row):  # between digits Python takes it, and no other program
+            raise ValueError
         values.extend([float(cell) for cell in row])
     except ValueError:
         for name, cell in zip(heading, row):
@@ -160,7 +169,7 @@ def _take(values: "array[float]", row: Sequence[str], heading: Sequence[str], wh
 def _number(cell: str) -> float | None:
     """Of a cell; a truth value, as pandas writes it, is 1 or 0."""
     try:
-        return float(cell)
+        return float(cell) if "_" not in cell else None
     except ValueError:
         return {"true": 1.0, "false": 0.0}.get(cell.strip().lower())
 

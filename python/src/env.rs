@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Mutex;
 
-use nearl_runtime::Snapshot;
+use nearl_runtime::{Manifest, Snapshot};
 use nearl_trainer::env::{self, ChaCha8Rng, EnvError, Fault, SeedableRng};
-use nearl_trainer::run_folder;
-use nearl_trainer::tasks as task_files;
+use nearl_trainer::tasks::{self as task_files, TaskLoadError};
+use nearl_trainer::{mj, robot, run_folder};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 
@@ -53,6 +53,7 @@ impl Inner {
 pub(crate) struct Env {
     inner: Mutex<Inner>,
     spec: env::Spec,
+    folder: Option<PathBuf>,
 }
 
 type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, f64, bool, Option<&'static str>);
@@ -61,20 +62,25 @@ type Stepped<'py> = (Bound<'py, PyArray1<f64>>, f64, f64, bool, Option<&'static 
 impl Env {
     #[new]
     fn new(py: Python<'_>, task: &str) -> PyResult<Env> {
-        let env = py.detach(|| task_files::env(task)).map_err(errors::task)?;
-        Ok(Env::around(env))
+        let made = py.detach(|| {
+            let manifest = task_files::load(task, &[])?;
+            Ok::<_, TaskLoadError>((env::of_task(&manifest, task)?, manifest))
+        });
+        let (env, manifest) = made.map_err(errors::task)?;
+        Ok(Env::around(env, &manifest))
     }
 
     /// The environment that a snapshot, or the run in a folder, was trained in.
     #[staticmethod]
     fn of_snapshot(py: Python<'_>, path: PathBuf) -> PyResult<Env> {
-        let env = py.detach(|| {
+        let (env, manifest) = py.detach(|| {
             let file =
                 if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
             let manifest = Snapshot::load(&file).map_err(errors::snapshot)?.manifest;
-            env::of_task(&manifest, &manifest.task.name).map_err(errors::value)
+            let env = env::of_task(&manifest, &manifest.task.name).map_err(errors::value)?;
+            Ok::<_, PyErr>((env, manifest))
         })?;
-        Ok(Env::around(env))
+        Ok(Env::around(env, &manifest))
     }
 
     /// Starts an episode from the task's own distribution; `seed` restarts the random stream. Returns the observation (n_obs).
@@ -243,10 +249,17 @@ impl Env {
         self.spec.max_episode_steps
     }
 
-    /// The robot file's text.
+    /// The robot file's text, with the places of files that it names by a package of ROS.
     #[getter]
     fn model_text(&self, py: Python<'_>) -> String {
-        self.with(py, |inner| inner.env.model_text().to_owned())
+        let folder = self.folder.as_deref();
+        self.with(py, |inner| mj::placed(inner.env.model_text(), folder))
+    }
+
+    /// The folder from which the robot file names other files; None where it names none.
+    #[getter]
+    fn model_folder(&self) -> Option<PathBuf> {
+        self.folder.clone()
     }
 
     fn __repr__(&self) -> String {
@@ -260,9 +273,12 @@ impl Env {
 }
 
 impl Env {
-    fn around(env: Box<dyn env::Env>) -> Env {
+    fn around(env: Box<dyn env::Env>, manifest: &Manifest) -> Env {
         let spec = env.spec().clone();
-        Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec }
+        // a native environment brings its own robot, which names no file
+        let file = robot::simulation(manifest).filter(|file| file.text == env.model_text());
+        let folder = file.and_then(|file| file.folder);
+        Env { inner: Mutex::new(Inner { env, rng: ChaCha8Rng::seed_from_u64(0) }), spec, folder }
     }
 
     /// Runs `f` on the environment with the interpreter released.

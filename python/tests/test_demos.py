@@ -527,3 +527,85 @@ def test_a_robot_whose_base_floats_is_drawn_where_it_is() -> None:
     renderer.close()
     assert all(picture.std() > 5 for picture in pictures), "not an empty picture"
     assert np.abs(pictures[0] - pictures[1]).mean() > 2
+
+
+def test_a_column_of_actions_that_is_given_twice_is_named(tmp_path: Path) -> None:
+    columns, out = episode() | {"m0": np.zeros(30), "m1": np.zeros(30)}, tmp_path / "a.npz"
+    for actions, name in ((["m0"] * 3, "m0"), (["m0", "m1", "m1"], "m1")):
+        with pytest.raises(demos.BadDemonstrations, match=rf"actions has '{name}' twice; give one column for each actuator, "):
+            demos.from_columns("Hopper-v5", [columns], out, dt=0.008, actions=actions)
+    assert not out.exists()
+
+
+def test_an_entry_of_robomimic_that_is_given_twice_is_named(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    columns, out = episode(), tmp_path / "a.npz"
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file["data/demo_0/obs/state"] = np.stack(list(columns.values()), 1)
+        file["data/demo_0/actions"] = np.zeros((30, 3))
+    of = {name: ("state", k) for k, name in enumerate(columns)}
+    with pytest.raises(demos.BadDemonstrations, match=r"actions has \('actions', 0\) twice; give one column for each actuator, "):
+        demos.from_robomimic("Hopper-v5", tmp_path / "a.hdf5", out, dt=0.008, columns=of, actions=[("actions", 0), ("actions", 1), ("actions", 0)])
+    assert not out.exists()
+
+
+def test_an_entry_of_lerobot_that_is_given_twice_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    columns, out = episode(), tmp_path / "a.npz"
+    features = {"observation.state": ([*columns], np.stack(list(columns.values()), 1)), "action": (["hip", "knee", "foot"], np.zeros((30, 3)))}
+    folder = lerobot(tmp_path / "set", features, np.zeros(30, int))
+    with pytest.raises(demos.BadDemonstrations, match=r"actions has 'knee' twice; give one column for each actuator, "):
+        demos.from_lerobot("Hopper-v5", folder, out, actions=["hip", "knee", "knee"])
+    assert not out.exists()
+
+
+def test_a_heading_that_is_a_comment_is_named(tmp_path: Path) -> None:
+    """As numpy.savetxt writes one, unless it is told otherwise."""
+    columns, file = episode(), tmp_path / "walk.csv"
+    rows, heading = np.stack(list(columns.values()), 1), ",".join(columns)
+    convert = lambda: demos.from_csv("Hopper-v5", file, tmp_path / "a.npz", dt=0.008, overwrite=True)  # noqa: E731
+    for above in ("", "walks\n"):
+        np.savetxt(file, rows, delimiter=",", header=above + heading)
+        with pytest.raises(demos.BadDemonstrations, match=r"walk.csv': its heading begins with '#', '# q.rootx'; save with comments='', or take the sign away"):
+            convert()
+    np.savetxt(file, rows, delimiter=",", header="a walk, by hand")
+    with pytest.raises(demos.BadDemonstrations, match=r"walk.csv': its first line is numbers; begin with a heading"):
+        convert()
+    np.savetxt(file, rows, delimiter=",", header=heading, comments="")
+    assert convert().exists()
+
+
+@pytest.mark.parametrize("cell", ["1_0.5", "0.02_4", "1_0"])
+def test_a_cell_with_an_underscore_is_no_number(tmp_path: Path, cell: str) -> None:
+    """Python takes it between digits; it is a slip of the keyboard or no number at all."""
+    columns, file = episode(), tmp_path / "walk.csv"
+    lines = [[f"{value}" for value in row] for row in np.stack(list(columns.values()), 1)]
+    lines[4][1] = cell
+    file.write_text("\n".join(map(",".join, [columns, *lines])))
+    name = list(columns)[1]
+    with pytest.raises(demos.BadDemonstrations, match=rf"walk.csv', line 6: column '{name}' is '{cell}', which is no number; give a number, or leave"):
+        demos.from_csv("Hopper-v5", file, tmp_path / "a.npz", dt=0.008)
+    assert not (tmp_path / "a.npz").exists()
+
+
+def test_warnings_point_at_the_line_that_converts(tmp_path: Path) -> None:
+    """Of every reader, whatever is warned of: a column that is not used, a joint out of its range, a jump, velocities that positions do not follow."""
+    columns = episode() | {"remark": np.zeros(30)}
+    columns["q.foot_joint"] = np.where(np.arange(30) < 20, columns["q.foot_joint"], columns["q.foot_joint"] + 1.5)
+    columns["v.rootx"] = 40.0 * np.gradient(columns["q.rootx"], 0.008)
+    rows = np.stack(list(columns.values()), 1)
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(columns), comments="")
+    joints = [name for name in columns if name.startswith("q.")]
+    clip = {"fps": np.array(125), "joint_pos": np.stack([columns[name] for name in joints], 1), "joint_names": np.array([name[2:] for name in joints])}
+    np.savez(tmp_path / "a.npz", **clip)
+    readers = {
+        "columns": lambda: demos.from_columns("Hopper-v5", [columns], tmp_path / "1.npz", dt=0.008),
+        "csv": lambda: demos.from_csv("Hopper-v5", tmp_path / "a.csv", tmp_path / "2.npz", dt=0.008),
+        "motion": lambda: demos.from_motion("Hopper-v5", tmp_path / "a.npz", tmp_path / "3.npz"),
+    }
+    for name, read in readers.items():
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            read()
+        assert len(said) >= (1 if name == "motion" else 3), [str(w.message) for w in said]
+        assert {(w.filename, w.lineno) for w in said} == {(__file__, read.__code__.co_firstlineno)}, name

@@ -461,6 +461,11 @@ fn compile(text: &str, folder: Option<&Path>) -> Result<MjModel, MjError> {
     })
 }
 
+/// A robot file's text with the places of the files that it names by a package of ROS; `folder` is where it lies.
+pub fn placed(text: &str, folder: Option<&Path>) -> String {
+    packages::resolve(text.to_owned(), folder)
+}
+
 /// A text as a file of `folder`, or of no folder.
 fn as_file(text: &str, folder: Option<&Path>) -> Result<(PathBuf, MjVfs), MjError> {
     let path = folder.map_or(PathBuf::from("model.xml"), |folder| folder.join("nearl-robot.xml"));

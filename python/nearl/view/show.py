@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nearl.render import compiled
 from nearl.view.figure import Figure, led
 from nearl.view.panel import Panel
 from nearl.view.server import serve
@@ -35,7 +36,7 @@ class Page:
         import mujoco
 
         self.server, self._source = server, source
-        model = mujoco.MjModel.from_xml_string(source.robot.env.model_text)
+        model = compiled(mujoco, source.robot.env)
         server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         server.scene.add_grid("/floor", width=20.0, height=20.0)
@@ -79,6 +80,7 @@ def view(name: str, task: str | None = None, port: int = 8080, seconds: float | 
 
     Raises:
         ViewError: viser is not installed or of a version that cannot be checked, or the robot is not known.
+        VideoError: MuJoCo cannot read the robot file, or a file that it names.
         ConnectionError: there is no loop.
     """
     try:
