@@ -33,7 +33,7 @@ pub fn all() -> Vec<Explanation> {
 #[error("there is no code '{asked}'; did you mean {nearest}? `nearl explain` without a code lists all")]
 pub struct UnknownCode {
     asked: String,
-    /// The nearest one, or all that begin with what was asked for.
+    /// The nearest one, or all that have what was asked for as a word.
     nearest: String,
 }
 
@@ -42,12 +42,13 @@ pub struct UnknownCode {
 /// # Errors
 /// [`UnknownCode`] with the nearest one that exists.
 pub fn find(all: &[Explanation], code: &str) -> Result<Explanation, UnknownCode> {
-    if let Some(found) = all.iter().find(|e| e.code == code) {
+    let asked = code.to_lowercase();
+    if let Some(found) = all.iter().find(|e| e.code == asked) {
         return Ok(*found);
     }
-    let of_it = all.iter().filter(|e| e.code.strip_prefix(code).is_some_and(|rest| rest.starts_with('-')));
+    let of_it = all.iter().filter(|e| format!("-{}-", e.code).contains(&format!("-{asked}-")));
     let of_it: Vec<String> = of_it.map(|e| format!("'{}'", e.code)).collect();
-    let like = |e: &&Explanation| (strsim::jaro(e.code, code) * 1e6) as u64;
+    let like = |e: &&Explanation| (strsim::jaro(e.code, &asked) * 1e6) as u64;
     let nearest = || all.iter().max_by_key(like).map_or("none".into(), |e| format!("'{}'", e.code));
     let nearest = if of_it.is_empty() { nearest() } else { of_it.join(", ") };
     Err(UnknownCode { asked: code.to_owned(), nearest })
@@ -85,6 +86,9 @@ mod tests {
     fn an_unknown_code_names_the_nearest() {
         let text = find(&all(), "stale-sate").unwrap_err().to_string();
         assert!(text.contains("'stale-state'"), "{text}");
+        let text = find(&all(), "Implausible").unwrap_err().to_string();
+        assert!(text.contains("'implausible-state'"), "{text}");
+        assert_eq!(find(&all(), "Degraded").unwrap().code, "degraded");
         let text = find(&all(), "braked").unwrap_err().to_string();
         assert!(
             text.contains("'braked-no-verified-brake'") && text.contains("'braked-non-finite-proposal'"),

@@ -46,6 +46,12 @@ impl Stop {
     }
 }
 
+/// Has a write beyond the largest size of files (`ulimit -f`) fail as on a full disk, which is said in a sentence; the signal would end the program.
+pub fn outlive_file_sizes() {
+    // SAFETY: nothing runs where a signal is ignored.
+    unsafe { libc::signal(libc::SIGXFSZ, libc::SIG_IGN) };
+}
+
 /// The signals that ask a program to end: SIGINT, SIGTERM, and SIGHUP, which a terminal sends that is closed, unless it is ignored as `nohup` has it.
 pub fn ending() -> impl Iterator<Item = i32> {
     let mut now = std::mem::MaybeUninit::<libc::sigaction>::zeroed();

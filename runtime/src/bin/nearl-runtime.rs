@@ -40,6 +40,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
+    nearl_runtime::stop::outlive_file_sizes();
     let result = match Arguments::parse().command {
         Command::Run(command) => command.run(),
         Command::Limits(command) => command.run(),

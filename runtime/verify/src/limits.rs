@@ -9,7 +9,7 @@ use crate::collision::Collision;
 use crate::drives::Drives;
 use crate::motion::Machine;
 use crate::robot::{Range, Robot, Shape};
-use crate::rows::{Equal, Row, Rule, SHORT, Soft, Term};
+use crate::rows::{BY_ITS_TARGET, Equal, Row, Rule, SHORT, Soft, Term};
 use crate::space::{Vec3, dot, norm, times};
 
 /// `[constraints]`. A key that is not known here is not verified, and refused by name.
@@ -447,14 +447,14 @@ impl Section {
             let range = of.machine.single(dof).map(|iq| (iq, range));
             let range = range.filter(|(_, ends)| ends.iter().any(|end| end.is_finite()));
             let parts = [
-                Some((false, None, "at the start")),
-                (of.sub_steps != 1).then_some((true, None, "at the end")), // with one step the force is the same
-                range.is_some().then_some((false, range, "by its target")),
+                Some((false, None, " at the start")),
+                (of.sub_steps != 1).then_some((true, None, " at the end")), // with one step the force is the same
+                range.is_some().then_some((false, range, BY_ITS_TARGET)),
             ];
             for (at_end, range, at) in parts.into_iter().flatten() {
                 let all = all.clone();
                 let rule = Rule::Drive { dof, most: effort, at_end, range, all };
-                rows.push(Row::new("torque", &format!("{} {at}", of.name(dof)), effort, soft, rule));
+                rows.push(Row::new("torque", &format!("{}{at}", of.name(dof)), effort, soft, rule));
             }
         }
         for speed in &self.frame_speed {

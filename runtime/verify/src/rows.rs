@@ -134,9 +134,15 @@ const TAKEN_OFF: f64 = 2.0;
 /// A state so far outside what can stop is inside [rad or m].
 const ROUNDING: f64 = 1e-10;
 
+/// How the name of a row ends that is of the target of a drive.
+pub(crate) const BY_ITS_TARGET: &str = " by its target";
+
 impl Row {
     /// Its name as the subject of a sentence.
     pub(crate) fn subject(&self) -> String {
+        if let Rule::Drive { range: Some(_), .. } = self.rule {
+            return format!("target of the drive of '{}'", self.name.trim_end_matches(BY_ITS_TARGET));
+        }
         match self.kind {
             "user" => format!("row '{}'", self.name),
             kind => format!("{kind} of '{}'", self.name),
@@ -182,7 +188,18 @@ impl Row {
                 let v = if *at_start { passage.v } else { passage.v1 };
                 (passage.tau[*dof] + slope * v[*dof], *most, "N m or N")
             }
-            Rule::Drive { most, .. } => (self.excess(m, p, passage)[1] * most + most, *most, "N m or N"),
+            Rule::Drive { dof, most, range, all, .. } => {
+                let [below, above] = self.excess(m, p, passage);
+                let side = if below > above { -1.0 } else { 1.0 };
+                let force = side * (below.max(above) * most + most);
+                let Some((iq, _)) = range else { return (force, side * most, "N m or N") };
+                // The force of the passage and the one that is to hold there, each by its target.
+                let [stiffness, damping] = all.gains(*dof);
+                let (q, v) = (passage.q[*iq], passage.v[*dof]);
+                let asked = passage.tau[*dof] + all.ends(m, p, passage)[*dof][0];
+                let target = |force: f64| q + (force + damping * v) / stiffness;
+                (target(asked), target(asked - side * below.max(above) * most), "rad or m")
+            }
             Rule::Jerk { most, .. } => {
                 (self.excess(m, p, passage)[1] * most + most, *most, "rad/s^3 or m/s^3")
             }

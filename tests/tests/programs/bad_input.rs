@@ -419,6 +419,22 @@ fn a_reader_that_closes_the_pipe_ends_the_program_quietly() {
     assert!(output.status.code() == Some(1) && error.contains("standard output"), "{error}");
 }
 
+/// `ulimit -f` sends a signal, which ended the program without a word.
+#[test]
+fn a_file_beyond_the_largest_size_is_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let line = format!("ulimit -f 1; exec {} export \"$1\" --out policy.onnx", program("nearl").display());
+    let mut command = Command::new("sh");
+    let output =
+        command.args(["-c", &line, "sh"]).arg(panda()).current_dir(&folder).output().expect("output");
+    let error = String::from_utf8_lossy(&output.stderr);
+    assert!(
+        output.status.code() == Some(1) && error.contains("policy.onnx") && error.contains("too large"),
+        "{error}"
+    );
+    assert!(!folder.path().join("policy.onnx").exists());
+}
+
 /// The doctor's lines: `ok`, `warn` or `fail`, then what was looked at.
 fn doctor(arguments: &[&str]) -> (Option<i32>, Vec<(String, String)>, String) {
     let output = Process::nearl(&[&["doctor"], arguments].concat()).output();

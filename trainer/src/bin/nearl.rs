@@ -7,6 +7,7 @@ use std::process::ExitCode;
 static ALLOCATOR: nearl_trainer::allocations::Counting = nearl_trainer::allocations::Counting;
 
 fn main() -> ExitCode {
+    nearl_runtime::stop::outlive_file_sizes();
     match Cli::read().run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(e) => {

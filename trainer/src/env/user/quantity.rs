@@ -244,9 +244,13 @@ impl Names {
         match scored.max_by(|a, b| a.0.total_cmp(&b.0)) {
             Some((score, near)) if score > 0.75 => format!("; did you mean '{near}'?"),
             _ => {
-                let all: Vec<_> = self.0.iter().take(12).map(|(n, _)| n.as_str()).collect();
-                let more = if self.0.len() > all.len() { ", ..." } else { "" };
-                format!("; there are {}{more}", all.join(", "))
+                // Those that begin alike, where there are any.
+                let begins = name.split_once('.').map(|(begin, _)| format!("{begin}."));
+                let like = |n: &str| begins.as_ref().is_some_and(|begin| n.starts_with(begin));
+                let is_one = self.0.iter().any(|(n, _)| like(n));
+                let all = || self.0.iter().map(|(n, _)| n.as_str()).filter(|n| !is_one || like(n));
+                let more = if all().count() > 12 { ", ..." } else { "" };
+                format!("; there are {}{more}", all().take(12).collect::<Vec<_>>().join(", "))
             }
         }
     }
