@@ -257,6 +257,7 @@ impl PlantRunner {
             if self.state.v().iter().all(|v| v.abs() < STILL) {
                 return;
             }
+            self.report.ticks += 1;
             self.report.braked += 1;
             plant.brake();
             if self.settings.pace == Pace::RealTime {
