@@ -1,4 +1,4 @@
-//! `nearl robot`: joints, limits and motors of a robot file.
+//! `nearl robot`: joints, limits, motors and frames of a robot file.
 
 use std::path::PathBuf;
 
@@ -45,6 +45,7 @@ impl RobotCommand {
         ));
         joints(&description, &model);
         motors(&description);
+        frames(&model);
         let left = robot::simulated_alone(&self.file)?;
         description.notes.iter().chain(&left).for_each(|note| say(format!("note: {note}")));
         Ok(())
@@ -64,7 +65,23 @@ fn joints(description: &RobotDescription, model: &Model) {
     }
 }
 
+/// Names that frame limits and the places of a task's expressions (`x.NAME`) take, in lines of a width that is read.
+fn frames(model: &Model) {
+    let mut line = String::from("frames");
+    for name in model.frame_names().filter(|name| !name.is_empty()) {
+        if line.chars().count() + name.chars().count() > 150 {
+            say(std::mem::replace(&mut line, "frames".into()));
+        }
+        line += " ";
+        line += name;
+    }
+    say(line);
+}
+
 fn motors(description: &RobotDescription) {
+    if description.motors.is_empty() {
+        say("motors: none, so that nothing drives a joint (an MJCF has them under <actuator>)");
+    }
     for motor in &description.motors {
         let command = format!("{:?}", motor.command).to_lowercase();
         let law = match &motor.not_modelled {
