@@ -86,34 +86,11 @@ struct Velocimeter {
 
 /// The velocimeters that an MJCF names; a URDF has none.
 fn velocimeters(text: &str) -> Vec<Velocimeter> {
-    let mut found = Vec::new();
-    let mut rest = text;
-    while let Some(at) = rest.find('<') {
-        rest = &rest[at..];
-        if rest.starts_with("<!--") {
-            rest = rest.split_once("-->").map_or("", |(_, after)| after);
-            continue;
-        }
-        let (tag, after) = rest.split_once('>').unwrap_or((rest, ""));
-        rest = after;
-        let Some(attributes) = tag.strip_prefix("<velocimeter") else { continue };
-        let get = |key: &str| attribute(attributes, key).unwrap_or_default();
-        found.push(Velocimeter { name: get("name"), site: get("site") });
-    }
-    found
-}
-
-/// The value of an attribute among those of an element.
-fn attribute(of: &str, key: &str) -> Option<String> {
-    let mut rest = of;
-    while let Some((name, after)) = rest.split_once('=') {
-        let after = after.trim_start();
-        let quote = after.chars().next().filter(|c| *c == '"' || *c == '\'')?;
-        let (value, next) = after[1..].split_once(quote)?;
-        if name.trim() == key {
-            return Some(value.to_string());
-        }
-        rest = next;
-    }
-    None
+    let Ok(document) = roxmltree::Document::parse(text) else { return Vec::new() };
+    let all = document.descendants().filter(|element| element.has_tag_name("velocimeter"));
+    all.map(|element| {
+        let get = |key: &str| element.attribute(key).unwrap_or_default().to_owned();
+        Velocimeter { name: get("name"), site: get("site") }
+    })
+    .collect()
 }
