@@ -325,6 +325,21 @@ fn terms_of_mjlab_have_their_scales_clips_and_histories() {
     assert_seen(of_mjlab(&old, &robot, PERIOD), &want);
 }
 
+/// Pose and scale of the metadata had been taken for those of the recipe's joints.
+#[test]
+fn joints_in_another_order_than_mjlab_s_need_their_own_pose_and_scale() {
+    let robot = floating(IMU, SENSORS);
+    let turned = format!("{PERIOD}[policy]\njoints = [\"knee\", \"hip\"]\n");
+    let error = of_mjlab(&[], &robot, &turned).expect_err("another order");
+    assert!(
+        error.contains("'joint_names'") && error.contains("state policy.pose and policy.action"),
+        "{error}"
+    );
+    of_mjlab(&[], &robot, &format!("{turned}pose = [-0.2, 0.1]\naction = {{ scale = 0.5 }}\n"))
+        .expect("stated");
+    of_mjlab(&[], &robot, &turned.replace("\"knee\", \"hip\"", "\"hip\", \"knee\"")).expect("the same order");
+}
+
 /// They had been left out without a word, and the policy saw other numbers.
 #[test]
 fn terms_of_mjlab_that_cannot_be_read_are_refused_by_key() {

@@ -32,6 +32,13 @@ const FLAT: &str = "observation_terms_flatten_history_dim";
 pub(super) fn recipe(network: &ImportedNetwork, recipes: &[Table]) -> Result<Table, ImportError> {
     let get = |key: &str| network.metadata.get(key).map(String::as_str).filter(|v| !v.is_empty());
     let joints = list(get("joint_names").unwrap_or_default());
+    let orders = recipes.iter().filter_map(|recipe| recipe.get("policy")?.get("joints"));
+    let is_other = orders.last().is_some_and(|stated| *stated != strings(&joints));
+    if is_other && !(states(recipes, "pose") && states(recipes, "action")) {
+        let reason = "a recipe states policy.joints otherwise, and the pose and the scale of the actions beside them are in this order; state policy.pose and \
+                      policy.action in the recipe too, or leave its joints out";
+        return Err(refuse("joint_names", reason.into()));
+    }
     let mut policy = Table::new();
     policy.insert("joints".into(), strings(&joints));
     if let Some(pose) = get("default_joint_pos") {
