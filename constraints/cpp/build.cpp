@@ -87,9 +87,9 @@ double nc_model_mass(const nc_model *m) {
 int nc_model_set_armature(nc_model *m, const double *armature) {
   return guard([&] {
     m->model.armature = input(armature, m->model.nv);
-    m->borne.clear();
+    m->with_armature.clear();
     for (const auto &joint : m->model.joints) {
-      if (joint.nv() == 6 && input(armature + joint.idx_v(), 3).any()) m->borne.push_back(joint.idx_v());
+      if (joint.nv() == 6 && input(armature + joint.idx_v(), 3).any()) m->with_armature.push_back(joint.idx_v());
     }
   });
 }

@@ -24,13 +24,13 @@ static inline Input input(const double *p, Eigen::Index n) { return Input(Eigen:
 
 struct nc_model {
   pin::Model model;
-  std::vector<int> borne; // idx_v of the free joints with an armature
+  std::vector<int> with_armature; // idx_v of the free joints with an armature
 
   // MuJoCo's armature of a free joint acts on the acceleration of its origin in the world, Pinocchio's on the change of the velocity's components in the
   // moving body; they differ by w x v. Adds `sign` times the force of that to `force`.
-  void bear(const double *v, double sign, double *force) const {
+  void add_turning(const double *v, double sign, double *force) const {
     using Three = Eigen::Map<const Eigen::Vector3d>;
-    for (const int i : borne) {
+    for (const int i : with_armature) {
       const Eigen::Vector3d turned = Three(v + i + 3).cross(Three(v + i));
       for (int k = 0; k < 3; k++) force[i + k] += sign * model.armature[i + k] * turned[k];
     }

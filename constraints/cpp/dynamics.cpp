@@ -19,7 +19,7 @@ int nc_rnea(const nc_model *m, nc_data *d, const double *q, const double *v, con
   const auto &x = m->model;
   return guard([&] {
     VectorMap(tau, x.nv) = pin::rnea(x, d->data, input(q, x.nq), input(v, x.nv), input(a, x.nv));
-    m->bear(v, 1.0, tau);
+    m->add_turning(v, 1.0, tau);
   });
 }
 
@@ -37,7 +37,7 @@ int nc_nle(const nc_model *m, nc_data *d, const double *q, const double *v, doub
   const auto &x = m->model;
   return guard([&] {
     VectorMap(nle, x.nv) = pin::nonLinearEffects(x, d->data, input(q, x.nq), input(v, x.nv));
-    m->bear(v, 1.0, nle);
+    m->add_turning(v, 1.0, nle);
   });
 }
 
@@ -48,7 +48,7 @@ int nc_nle_by_velocity(const nc_model *m, nc_data *d, const double *q, const dou
     pin::computeRNEADerivatives(x, d->data, input(q, x.nq), input(v, x.nv), Input(d->dq));
     MatrixMap out(by_velocity, x.nv, x.nv); // its columns are the rows
     out = d->data.dtau_dv.transpose();
-    for (const int i : m->borne) {
+    for (const int i : m->with_armature) {
       const auto v3 = [v, i](int k) { return v[i + k % 3]; };
       const auto w3 = [v, i](int k) { return v[i + 3 + k % 3]; };
       for (int k = 0; k < 3; k++) { // row k of w x v: w[k+1] v[k+2] - w[k+2] v[k+1]
@@ -65,12 +65,12 @@ int nc_nle_by_velocity(const nc_model *m, nc_data *d, const double *q, const dou
 int nc_aba(const nc_model *m, nc_data *d, const double *q, const double *v, const double *tau, double *a) {
   const auto &x = m->model;
   return guard([&] {
-    if (m->borne.empty()) {
+    if (m->with_armature.empty()) {
       VectorMap(a, x.nv) = pin::aba(x, d->data, input(q, x.nq), input(v, x.nv), input(tau, x.nv), pin::Convention::WORLD);
       return;
     }
     d->dq = input(tau, x.nv);
-    m->bear(v, -1.0, d->dq.data());
+    m->add_turning(v, -1.0, d->dq.data());
     VectorMap(a, x.nv) = pin::aba(x, d->data, input(q, x.nq), input(v, x.nv), Input(d->dq), pin::Convention::WORLD);
   });
 }

@@ -2,6 +2,7 @@
 
 use crate::Model;
 use crate::friction::MadeUpFor;
+use crate::kinematics::cross;
 use crate::pinocchio::{self, RawData};
 use crate::viability::Period;
 use std::ffi::c_int;
@@ -16,6 +17,8 @@ pub struct Dynamics {
     lengths: (usize, usize),
     /// Some joint has a spring.
     sprung: bool,
+    /// First dof of each free joint with a damper.
+    floating: Vec<usize>,
     middle: Middle,
 }
 
@@ -45,7 +48,26 @@ impl Dynamics {
             by_velocity: vec![0.0; lengths.1 * lengths.1],
         };
         let sprung = model.stiffness().iter().any(|k| *k != 0.0);
-        Dynamics { scratch: RawData::new(model.raw()), model: model.clone(), lengths, sprung, middle }
+        let is_damped = |i: usize| (i..i + 3).any(|i| model.damping()[i] != 0.0);
+        let joints = model.joints().iter().filter(|joint| joint.nv == 6 && is_damped(joint.idx_v));
+        let floating = joints.map(|joint| joint.idx_v).collect();
+        Dynamics {
+            scratch: RawData::new(model.raw()),
+            model: model.clone(),
+            lengths,
+            sprung,
+            floating,
+            middle,
+        }
+    }
+
+    /// By how much more than its entry of `a` each dof of a damped free joint accelerates in the world, at velocity `v`: `w x v`, as the axes turn with the
+    /// base. A damper that a step takes implicitly acts on that.
+    pub(crate) fn turning<'a>(&'a self, v: &'a [f64]) -> impl Iterator<Item = (usize, f64)> + 'a {
+        self.floating.iter().flat_map(move |&i| {
+            let turned = cross([v[i + 3], v[i + 4], v[i + 5]], [v[i], v[i + 1], v[i + 2]]);
+            (0..3).map(move |k| (i + k, turned[k]))
+        })
     }
 
     /// Inverse dynamics `tau = M a + nle`, without the passive forces: a motor supplies `tau - passive`.
@@ -152,6 +174,9 @@ impl Dynamics {
             for (i, force) in m.force.iter_mut().enumerate() {
                 *force += period.implicit(&self.model, i) * a[i];
             }
+            for (i, more) in self.turning(v) {
+                m.force[i] += period.implicit(&self.model, i) * more;
+            }
             self.aba(q, v, &m.force, &mut m.step);
         }
     }
@@ -190,6 +215,9 @@ impl Dynamics {
         for (i, tau) in tau.iter_mut().enumerate() {
             *tau += period.resistance(&self.model, i) * a[i] - m.force[i];
         }
+        for (i, more) in self.turning(v) {
+            tau[i] += period.resistance(&self.model, i) * more;
+        }
         self.middle = m;
     }
 
@@ -212,6 +240,9 @@ impl Dynamics {
         for i in 0..nv {
             rows[i * nv + i] += period.resistance(&self.model, i);
             bias[i] -= m.force[i];
+        }
+        for (i, more) in self.turning(v) {
+            bias[i] += period.resistance(&self.model, i) * more;
         }
         self.middle = m;
     }

@@ -33,6 +33,8 @@ pub struct PeriodDynamics {
     bias: Vec<f64>,
     /// `M^-1 (M + tau_s D)` (nv x nv, row-major): what friction sees of an acceleration before an implicit damper takes its share.
     before: Vec<f64>,
+    /// What of that does not depend on the acceleration, as a base turns (nv).
+    turned: Vec<f64>,
     /// Dofs whose acceleration is looked for.
     free: Vec<usize>,
     /// Forces that fall away for a unit of acceleration of a dof (nv), and those without acceleration.
@@ -72,6 +74,7 @@ impl PeriodDynamics {
             rows: vec![0.0; nv * nv],
             bias: vec![0.0; nv],
             before,
+            turned: vec![0.0; nv],
             free: Vec::with_capacity(nv),
             resistance: vec![0.0; nv],
             force: vec![0.0; nv],
@@ -93,6 +96,10 @@ impl PeriodDynamics {
             self.before.fill(0.0);
             (0..nv).for_each(|i| self.before[i * nv + i] = self.period.implicit(model, i));
             solve(nv, nv, &mut self.matrix, &mut self.before);
+            self.turned.fill(0.0);
+            for (j, more) in self.dynamics.turning(v) {
+                (0..nv).for_each(|i| self.turned[i] += self.before[i * nv + j] * more);
+            }
             (0..nv).for_each(|i| self.before[i * nv + i] += 1.0);
         }
     }
@@ -190,7 +197,10 @@ impl PeriodDynamics {
             return MadeUpFor::default();
         }
         let before = &self.before[i * a.len()..(i + 1) * a.len()];
-        let solved = if self.dampers { before.iter().zip(a).map(|(s, a)| s * a).sum() } else { a[i] };
+        let solved = match self.dampers {
+            true => before.iter().zip(a).map(|(s, a)| s * a).sum::<f64>() + self.turned[i],
+            false => a[i],
+        };
         MadeUpFor::of(self.dynamics.model(), i, &self.period, self.v[i], a[i], solved)
     }
 

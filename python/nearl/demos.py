@@ -425,10 +425,11 @@ def from_motion(
     return from_columns(task, [columns], out, dt=seconds_between(clip["fps"], source), period=period, overwrite=overwrite, source=source)
 
 
-def _check_once(actions: Sequence[str | tuple[str, int]], env: _core.Env, source: str) -> None:
+def _check_once(actions: Sequence[str | tuple[str, int]] | None, env: _core.Env, source: str) -> None:
     """Refuses a column that is to be the action of two actuators."""
-    for k, name in enumerate(actions):
-        if name in actions[:k]:
+    given = actions or ()
+    for k, name in enumerate(given):
+        if name in given[:k]:
             raise BadDemonstrations(f"{source}: actions has {name!r} twice; give one column for each actuator, {', '.join(env.actuator_names)}")
 
 

@@ -138,11 +138,12 @@ def import_torch(
     if isinstance(module, str | os.PathLike) and _is_torchscript(module):
         raise ValueError(f"'{os.fspath(module)}' is a file of TorchScript, {_SCRIPT.format(f'torch.jit.load({os.fspath(module)!r})')}")
     _live(module, "import_torch", "torch.load")
-    if type(module).__name__ == "OptimizedModule" and _core(module):
+    if type(module).__name__ == "OptimizedModule" and _network_name(module):
         module = module._orig_mod  # as torch.compile wraps it
-    core = _core(module)
+    core = _network_name(module)
     if getattr(module, "is_recurrent", False) is True:
-        raise ValueError(f"module {type(module).__name__} is recurrent, which is none that layers consist of; train one without memory, or give it history")
+        kind = type(module).__name__
+        raise ValueError(f"module {kind} is recurrent, and only networks without memory are read; train one without, and give it the history as observations")
     network = [(core, getattr(module, core))] if core else [("", module)]
     _check_order(*network[0])
     layers = _layers(network)
@@ -449,7 +450,7 @@ def _range_of(output_clip: Any, n: int) -> tuple[Any, Any]:
     return low if low.shape else float(low), high if high.shape else float(high)
 
 
-def _core(module: Any) -> str:
+def _network_name(module: Any) -> str:
     """Name of the part of a module that is its network: its actor, or the mlp of a model of rsl_rl; empty where it is the network."""
     if hasattr(module, "actor"):
         return "actor"
@@ -470,7 +471,7 @@ def _export(module: Any, name: str = "module") -> str:
 
 def _beside(module: Any) -> dict[str, Any]:
     """What a module holds beside its actor, by name: parts, tensors and other objects, but no settings."""
-    core, held = _core(module), dict(getattr(module, "__dict__", {}))
+    core, held = _network_name(module), dict(getattr(module, "__dict__", {}))
     for table in ("_parameters", "_buffers", "_modules"):
         held |= held.pop(table, None) or {}
     held |= dict(getattr(module, "named_children", dict)())
@@ -492,7 +493,7 @@ def _normaliser(module: Any, mean: Any, std: Any) -> tuple[Any, Any]:
         return None, None
     name, normaliser = next(iter(found.items()))
     kind, ways = type(normaliser).__name__, f"give mean= and std= where it computes (observation - mean) / std; else {_export(module)}"
-    said = f"module {type(module).__name__} has {name} ({kind}) beside its {_core(module)}"
+    said = f"module {type(module).__name__} has {name} ({kind}) beside its {_network_name(module)}"
     if len(found) > 1:
         raise ValueError(f"{said}, and {', '.join(list(found)[1:])}, of which nobody knows which one is meant; {ways}")
     _check_hooks(name, normaliser)
@@ -542,7 +543,7 @@ def _of_batches(name: str, norm: Any) -> tuple[np.ndarray, np.ndarray]:
 def _check_run(module: Any, moments: tuple[np.ndarray, np.ndarray], read: Sequence[Policy], rounding: float) -> None:
     """Holds what a module itself gives against what was ``read`` of it, of which the first is imported and the others lack what may stand around the module.
     One that has nothing to run may have nothing beside its actor that nobody knows. `rounding` is the part that the precision of what was read loses."""
-    core = _core(module)
+    core = _network_name(module)
     kind, of = type(module).__name__, f"module.{core}" if core else "its layers"
     around = f"give nearl.import_torch({of}), with mean=, std=, clip= and output_clip= for what stands around it"
     give = f"where the {core} is all of the policy, {around}; else {_export(module)}" if core else _EXPORT
@@ -684,7 +685,7 @@ def _acting(module: Any) -> Iterator[Callable[[np.ndarray], Any]]:
         return
     parts = [(part, dict(vars(part)), dict(part._buffers)) for part in dict.fromkeys(part for of in modules for part in of.modules())]
     tensors = [(of, of.detach().clone()) for part, _, _ in parts for of in (*part._parameters.values(), *part._buffers.values()) if of is not None]
-    actor = getattr(module, _core(module) or "actor", None)
+    actor = getattr(module, _network_name(module) or "actor", None)
     of_actor = list(actor.parameters()) if isinstance(actor, torch.nn.Module) else []  # what is beside it may have another precision
     like = next((of for of in (*of_actor, *(of for of, _ in tensors)) if of.is_floating_point()), torch.zeros(1))
     with torch.no_grad(), torch.random.fork_rng(devices=[]):

@@ -529,6 +529,11 @@ def test_a_robot_whose_base_floats_is_drawn_where_it_is() -> None:
     assert np.abs(pictures[0] - pictures[1]).mean() > 2
 
 
+def test_actions_may_be_none(tmp_path: Path) -> None:
+    data = checked(demos.from_columns("Hopper-v5", [episode()], tmp_path / "none.npz", dt=0.008, actions=None))
+    assert "actions" not in data
+
+
 def test_a_column_of_actions_that_is_given_twice_is_named(tmp_path: Path) -> None:
     columns, out = episode() | {"m0": np.zeros(30), "m1": np.zeros(30)}, tmp_path / "a.npz"
     for actions, name in ((["m0"] * 3, "m0"), (["m0", "m1", "m1"], "m1")):

@@ -318,13 +318,23 @@ fn out_of_reach(m: &Manifest, parts: &Parts, loads: &[holding::Load]) -> Option<
         let Drive::Pd { stiffness, .. } = drives[i] else { return None };
         let weight = loads.iter().find(|load| load.dof == i)?.needed;
         let way = rubs + weight / stiffness;
-        let ([from, to], limits) = ([low + way, high - way], projector.limits());
-        let margin = (from - limits.q_lower[i]).max(limits.q_upper[i] - to);
-        let is_far = margin > TAKEN * (high - low) && from < to;
+        let (iq, limits) = (model.joint_of_dof(i).idx_q, projector.limits());
+        // Without a position limit the robot file's own ends, if it has any.
+        let end = |limit: f64, of_file: f64| if limit.is_finite() { limit } else { of_file };
+        let lower = end(limits.q_lower[i], model.lower_position_limit()[iq]);
+        let upper = end(limits.q_upper[i], model.upper_position_limit()[iq]);
+        let [from, to] = [low + way, high - way];
+        let margin = (from - lower).max(upper - to);
+        let is_far = margin.is_finite() && margin > TAKEN * (high - low);
         is_far.then(|| {
+            let held = match from < to {
+                true => format!(
+                    "from {from:.4} to {to:.4} rad or m, {margin:.4} short of a limit on its position"
+                ),
+                false => "nowhere".into(),
+            };
             format!(
-                "'{}' from {from:.4} to {to:.4} rad or m, {margin:.4} short of a limit on its position (friction {:.3}, weight at most {weight:.3} N m or N, \
-                 stiffness {stiffness})",
+                "'{}' {held} (friction {:.3}, weight at most {weight:.3} N m or N, stiffness {stiffness})",
                 model.dof_name(i),
                 model.friction()[i],
             )

@@ -32,7 +32,8 @@ pub struct Told {
     pub largest: f64,
 }
 
-/// How the simulator kept a kind of limit, margins included.
+/// How the simulator kept a kind of limit, margins included. A torque is that of the last physics step of a tick, held against the task's limit and the
+/// robot file's.
 #[derive(Debug, Clone, Serialize)]
 pub struct Measured {
     /// `acceleration` or `torque`.
@@ -141,7 +142,9 @@ pub fn evaluate(
     seed: u64,
     projection: bool,
 ) -> Result<Evaluation, RolloutError> {
-    evaluate_by(None, snapshot, episodes, seed, projection)
+    let mut worker = worker(None, snapshot, seed, projection)?;
+    worker.set_watch()?;
+    episodes_of(worker, snapshot, episodes, projection)
 }
 
 /// The same with rewards and ends of somebody else's, where there is a scorer.
@@ -152,15 +155,34 @@ pub(crate) fn evaluate_by(
     seed: u64,
     projection: bool,
 ) -> Result<Evaluation, RolloutError> {
+    episodes_of(worker(scorer, snapshot, seed, projection)?, snapshot, episodes, projection)
+}
+
+/// The environment and its controller.
+fn worker(
+    scorer: Option<Scorer>,
+    snapshot: &Snapshot,
+    seed: u64,
+    projection: bool,
+) -> Result<Worker, RolloutError> {
     let mut worker = Worker::new(make_env(snapshot)?, snapshot, 1.0, stream(seed, 0))?;
     if let Some(scorer) = scorer {
         worker.set_scorer(scorer);
     }
     worker.set_projection(projection);
+    Ok(worker)
+}
+
+/// Runs the episodes; what the simulator does is measured where the worker has a [`Watch`].
+fn episodes_of(
+    mut worker: Worker,
+    snapshot: &Snapshot,
+    episodes: usize,
+    projection: bool,
+) -> Result<Evaluation, RolloutError> {
     let (model, layout) = (worker.controller.model(), worker.controller.layout());
     let own = without_margins(&snapshot.manifest, model, layout.controllable());
     worker.beyond = Some((own.map_err(RolloutError::from)?, [None; 2]));
-    worker.set_watch()?;
     let mode = if projection { "projected" } else { "raw" };
     let mut e = Evaluation {
         mode,

@@ -162,7 +162,7 @@ pub enum PlantError {
     /// The robot that is simulated is not the one that is controlled.
     #[error("the simulation is not of the robot that is controlled: {0}")]
     Robot(String),
-    /// The limits to watch.
+    /// Limits or MuJoCo, for what is watched.
     #[error(transparent)]
     Watch(#[from] WatchError),
 }

@@ -31,7 +31,7 @@ pub(crate) struct Followers {
 
 /// How often a tick is projected again.
 const ROUNDS: usize = 40;
-/// Difference of velocities [rad/s or m/s], and as a share of their change, at which the loose dofs do what was reckoned with.
+/// Largest difference of velocities [rad/s or m/s], or as a share of their change where that is above 1, at which the loose dofs do what was reckoned with.
 const FOLLOWED: f64 = 1e-11;
 /// The longest step, as a multiple of a plain one.
 const LONGEST: f64 = 1e4;

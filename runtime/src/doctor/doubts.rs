@@ -40,7 +40,7 @@ pub(super) fn of(m: &Manifest, parts: &Parts) -> Vec<String> {
     notes.extend(undriven(m, parts));
     notes.extend(beyond_motors(m, parts, &drives));
     notes.extend(stopped(m, parts));
-    notes.extend(unguarded(m, parts));
+    notes.extend(unguarded(m, parts, &drives));
     notes.extend(without_range(m, parts));
     notes.extend(beyond_simulator(m));
     notes.extend(beyond_drives(m, parts, &drives));
@@ -87,6 +87,11 @@ fn moves_by_model(m: &Manifest) -> bool {
     m.proposes() && !m.bounds_drives()
 }
 
+/// Whether the robot's model says which forces lead to a target.
+fn leads_by_model(m: &Manifest) -> bool {
+    m.guards() || m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio
+}
+
 /// How notes begin of joints that mimic others and that a row holds together, or that nothing commands.
 fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<String> {
     let loose =
@@ -111,10 +116,13 @@ fn settled_mimics(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Vec<Stri
 }
 
 /// Limits that nothing is held to: those of states, of a policy that gives actions; and a policy made elsewhere that has none.
-fn unguarded(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String> {
+fn unguarded(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Drive]) -> Option<String> {
     let of = &m.task.constraints;
-    let floats = model.joints().iter().any(|j| j.nv > 1 && !layout.controllable().contains(&j.idx_v));
-    let guard = if floats { "\"drive\"" } else { "true" };
+    // On legs: the first joint floats, and drives lead the others.
+    let walks =
+        model.joints().first().is_some_and(|j| j.nv == 6 && !layout.controllable().contains(&j.idx_v))
+            && layout.controllable().iter().all(|&i| matches!(drives[i], Drive::Pd { .. }));
+    let guard = if walks { "\"drive\"" } else { "true" };
     let has_limits = REGISTRY.iter().any(|kind| !(kind.build)(of).is_empty());
     if m.policy != PolicyKind::Direct {
         return (m.algo == "import" && !has_limits).then(|| {
@@ -140,14 +148,17 @@ fn unguarded(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String
         format!(
             "the limits on states under [constraints]{but} hold for nothing: this policy gives actions, and guard is off; {first}add guard = {guard} to \
              [constraints] to hold {}",
-            if floats { "those of drives' forces" } else { "them" }
+            if walks { "those of its drives' forces (torque, torque_rate)" } else { "them" }
         )
     })
 }
 
 /// Simulated drives without a range of targets, which no environment takes.
 fn without_range(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<String> {
-    m.simulation.as_ref().filter(|simulation| simulation.format == ModelFormat::Mjcf)?;
+    let file = m.simulation.as_ref().filter(|simulation| simulation.format == ModelFormat::Mjcf)?;
+    if file.text.contains("clampctrl") {
+        return None; // switched off, ranges that are there count for nothing
+    }
     let named = |&i: &usize| {
         let joint = model.dof_name(i);
         let motor = model.motors().iter().find(|motor| motor.joint == joint)?;
@@ -156,8 +167,8 @@ fn without_range(m: &Manifest, Parts { model, layout, .. }: &Parts) -> Option<St
     let names: Vec<String> = layout.controllable().iter().filter_map(named).collect();
     (!names.is_empty()).then(|| {
         format!(
-            "actuators {} have no ctrlrange, and no training and no `nearl plant` takes a robot file without: write one that goes beyond the range of the \
-             joint by what the drive needs to brake there, its largest force by its stiffness at most",
+            "actuators {} have no ctrlrange, and no training and no `nearl plant` takes such a robot file: give each a ctrlrange that goes beyond the range of \
+             its joint by up to forcerange / kp",
             names.join(", ")
         )
     })
@@ -198,6 +209,9 @@ fn beyond_simulator(m: &Manifest) -> Vec<String> {
     notes
 }
 
+/// The share of a drive's force below which a guard on forces leaves it little.
+const MOSTLY: f64 = 0.5;
+
 /// What a guard on the forces of drives does not hold, and what the plant has that it does not reckon with.
 fn beyond_drives(m: &Manifest, Parts { model, layout, projector }: &Parts, drives: &[Drive]) -> Vec<String> {
     if !m.bounds_drives() {
@@ -218,27 +232,34 @@ fn beyond_drives(m: &Manifest, Parts { model, layout, projector }: &Parts, drive
     let swings = |&i: &usize| {
         let Drive::Pd { stiffness, damping } = drives[i] else { return None };
         let (effort, acceleration) = (limits.effort[i], limits.acceleration[i]);
-        let bounds = acceleration.is_finite()
-            && force_left(&period, (stiffness, damping), effort, acceleration) <= 0.0;
-        bounds.then(|| format!("'{}' ({acceleration} rad/s² or m/s², {effort} N m or N)", model.dof_name(i)))
+        let left = force_left(&period, (stiffness, damping), effort, acceleration);
+        (acceleration.is_finite() && left < MOSTLY * effort).then(|| {
+            let left = if left > 0.0 { format!("{left:.3}") } else { "nothing".into() };
+            format!(
+                "'{}' ({left} of {effort:.3} N m or N at {acceleration} rad/s² or m/s²)",
+                model.dof_name(i)
+            )
+        })
     };
     let joints: Vec<String> = layout.controllable().iter().filter_map(swings).collect();
     if !joints.is_empty() {
         notes.push(format!(
-            "at their limits on acceleration the drives of {} change their force within a period of {} s by more than all of it, so that only the force at \
-             its start is kept; shorten time.dt, or lower the acceleration to what these joints do",
-            joints.join(", "),
-            period.dt
+            "joints at their limits on acceleration change the force of their drives within a period of {} s by so much that little of it may be used at its \
+             start, or, where nothing is left, that its end is not kept: {}; shorten time.dt, or lower the acceleration to what these joints do",
+            period.dt,
+            joints.join(", ")
         ));
     }
     let (delay, noise, random) = (&m.task.delay, &m.task.noise, &m.task.random);
     let has = |table: &toml::Table, section: &str, keys: &[&str]| -> Vec<String> {
         keys.iter().filter(|key| table.contains_key(**key)).map(|key| format!("{section}.{key}")).collect()
     };
+    let bias = noise.get("bias").and_then(toml::Value::as_table).cloned().unwrap_or_default();
     let otherwise = [
         has(delay, "delay", &["action", "observation"]),
-        has(noise, "noise", &["q", "v", "bias"]),
-        has(random, "random", &["stiffness", "damping"]),
+        has(noise, "noise", &["q", "v"]),
+        has(&bias, "noise.bias", &["q", "v"]),
+        has(random, "random", &["stiffness", "damping", "strength"]),
     ]
     .concat();
     if !otherwise.is_empty() {
@@ -449,7 +470,7 @@ fn beyond_motors(m: &Manifest, Parts { model, layout, .. }: &Parts, drives: &[Dr
 /// Joints that nothing keeps from the stops at the ends of their ranges, though their motion has limits: a stop knows none.
 fn stopped(m: &Manifest, Parts { model, layout, projector }: &Parts) -> Option<String> {
     let limits = projector.limits();
-    let by_model = m.guards() || m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
+    let by_model = leads_by_model(m);
     let meets = |&&i: &&usize| {
         let at = model.joint_of_dof(i).idx_q;
         let (low, high) = (model.lower_position_limit()[at], model.upper_position_limit()[at]);
@@ -507,7 +528,7 @@ pub(super) fn left_alone(Parts { model, layout, .. }: &Parts, held: &[usize]) ->
 /// What the robot's model does not promise of joints that nothing drives.
 fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
     let loose = left_alone(parts, &held_dofs(&parts.model, parts.layout.controllable()));
-    let by_model = m.guards() || m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
+    let by_model = leads_by_model(m);
     let (who, instead) = match m.guards() {
         true => {
             ("guard = true reckons", "guard = \"drive\" for a robot on legs, or \"simulator\" in training")
@@ -530,7 +551,8 @@ pub(super) fn rubbing(m: &Manifest, parts: &Parts, drives: &[Drive], k: usize) -
     let Drive::Pd { stiffness, .. } = drives[i] else { return None };
     let motors = Parts::motors(&parts.model, parts.layout.controllable(), drives).ok()?;
     let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
-    let [low, high] = ends.map(|end| motors.command(k, end));
+    let [one, other] = ends.map(|end| motors.command(k, end));
+    let [low, high] = [one.min(other), one.max(other)];
     ((high - low).is_finite()).then(|| ([low, high], parts.model.friction()[i] / stiffness))
 }
 

@@ -360,6 +360,87 @@ fn odd_set_ups_are_named_by_each_door_and_the_page_says_what_the_doctor_says() {
     assert!(found == page, "docs/DOCTOR.md is old: run the command in its fourth line");
 }
 
+const MOTORS: &str =
+    "<motor joint=\"shoulder\" ctrlrange=\"-80 80\"/>\n    <motor joint=\"elbow\" ctrlrange=\"-30 30\"/>";
+const ELBOW: &str = "range=\"-2.2 2.2\" damping=\"1\"";
+
+/// The arm with drives of stiffness 100 N m/rad, the elbow's with targets up to `end` \[rad\] and `friction` \[N m\], by a task with these changes.
+fn driven(folder: &Path, (end, friction): (f64, f64), changes: &[Edit]) -> PathBuf {
+    let drive = |joint: &str, end: f64| {
+        format!(
+            "<position joint=\"{joint}\" kp=\"100\" kv=\"10\" ctrlrange=\"-{end} {end}\" forcerange=\"-80 80\"/>"
+        )
+    };
+    let file = write(folder, SAME, SAME);
+    let robot = std::fs::read_to_string(folder.join("two_link.xml")).expect("robot");
+    let robot = robot.replace(MOTORS, &(drive("shoulder", 2.5) + &drive("elbow", end)));
+    let robot = robot.replace(ELBOW, &format!("{ELBOW} frictionloss=\"{friction}\""));
+    std::fs::write(folder.join("two_link.xml"), robot).expect("robot");
+    let command = "[command]\ninterface = \"pd\"\nstiffness = 100.0\ndamping = 10.0\n\n[constraints]";
+    let text = std::fs::read_to_string(&file).expect("task").replace("[constraints]", command);
+    let text = changes.iter().fold(text, |text, change| edited(text, *change));
+    std::fs::write(&file, text).expect("task");
+    file
+}
+
+/// What a training with `algo` says of it.
+fn advised(file: &Path, algo: &str) -> String {
+    let mut manifest = tasks::load(file.to_str().expect("UTF-8"), &[]).expect("task");
+    complete(&mut manifest).expect("manifest");
+    advice(algo.parse().expect("an algorithm"), &manifest).expect("advice").join("\n")
+}
+
+/// By hand: 20 N m at 100 N m/rad take 0.2 rad either way, of the 0.2 rad between targets of -0.1 and 0.1.
+#[test]
+fn drives_that_no_target_lets_make_up_for_friction_are_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let text = advised(&driven(folder.path(), (0.1, 20.0), &[]), "pid2-ib");
+    assert!(
+        text.contains(
+            "'elbow' (20.000 N m or N, which takes 0.400 rad or m of the 0.200 that its range has)"
+        ),
+        "{text}"
+    );
+    let text = advised(&driven(folder.path(), (2.5, 20.0), &[]), "pid2-ib");
+    assert!(!text.contains("make up for dry friction"), "{text}");
+}
+
+/// 25 N m take 0.25 rad off the targets of -2.2 to 2.2, beside the arm's weight; without a position limit the robot file's range counts.
+#[test]
+fn joints_that_drives_hold_in_a_part_of_their_range_are_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    let holding = |file: &Path| {
+        let snapshot = folder.path().join("first.safetensors");
+        train(file, &snapshot).expect("a snapshot");
+        examine(&snapshot, None).into_iter().find(|check| check.check == "holding").expect("holding")
+    };
+    for changes in [&[][..], &[("position = { margin = 0.02 }\n", "")]] {
+        let found = holding(&driven(folder.path(), (2.2, 25.0), changes));
+        assert!(found.finding == Finding::Warn && found.text.contains("'elbow' from -1.9"), "{}", found.text);
+        assert!(!found.text.contains("inf"), "{}", found.text);
+        let found = holding(&driven(folder.path(), (2.6, 1.0), changes));
+        assert!(found.finding == Finding::Ok, "{}", found.text);
+    }
+}
+
+/// A guard on the forces of drives knows nothing of the rest.
+#[test]
+fn what_a_guard_on_forces_does_not_hold_is_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    const GUARD: Edit = ("torque = {}", "torque = {}\nguard = \"drive\"");
+    const FORCES: Edit = ("position = { margin = 0.02 }\nvelocity = { limit = 4.0 }\n", "");
+    let says = |changes: &[Edit]| advised(&driven(folder.path(), (2.5, 0.0), changes), "ppo");
+    let text = says(&[GUARD, FORCES]);
+    assert!(!text.contains("constraints.guard is") && !text.contains("joints at their limits"), "{text}");
+    assert!(says(&[GUARD]).contains("nothing holds position, velocity of [constraints]"));
+    let delayed =
+        says(&[GUARD, FORCES, ("[reward]", "[delay]\naction = 1\n\n[random]\nstrength = 1.2\n\n[reward]")]);
+    assert!(delayed.contains("beside delay.action, random.strength the forces"), "{delayed}");
+    // 80 - (10 + 100 x 0.01) x 1000 x 0.01 is below 0.
+    let text = says(&[GUARD, FORCES, (ACCELERATION, "acceleration = { limit = 1000.0 }")]);
+    assert!(text.contains("'shoulder' (nothing of 80.000 N m or N at 1000 rad/s² or m/s²)"), "{text}");
+}
+
 /// A bundled task draws its own episodes: what it says is something that its user can do.
 #[test]
 fn a_bundled_task_advises_nothing_that_it_has_not() {

@@ -83,8 +83,9 @@ fn policy(seed: u64, guard: &str) -> Snapshot {
 struct Peaks {
     /// Largest force at any physics step, as a share of the effort, of joints that have accelerated by no more than [`ACCELERATION`] since the tick began.
     force: f64,
-    /// Of the others: in how many steps of a joint.
+    /// Of the others: in how many steps of a joint, and the largest force.
     sudden: u64,
+    sudden_force: f64,
     /// Largest change of a force from tick to tick [N m/s], away from switches and at them.
     rate: [f64; 2],
     /// Ticks whose targets were moved.
@@ -99,7 +100,7 @@ fn run(way: Way, ticks: usize) -> Peaks {
     let mut sim = mj::Sim::new(&model).expect("simulation");
     let mut controller = Controller::new(&policies[0]).expect("controller");
     let (mut state, mut out, noise) = (controller.state(), controller.output(), controller.noise());
-    let mut peaks = Peaks { force: 0.0, sudden: 0, rate: [0.0; 2], moved: 0, falls: 0 };
+    let mut peaks = Peaks { force: 0.0, sudden: 0, sudden_force: 0.0, rate: [0.0; 2], moved: 0, falls: 0 };
     let mut before: Option<Vec<f64>> = None;
     for tick in 0..ticks {
         if tick % (4 * SWITCH) == 0 || sim.qpos()[2] < 0.12 {
@@ -140,6 +141,7 @@ fn run(way: Way, ticks: usize) -> Peaks {
                 let change = (sim.qvel()[6 + i] - begun[6 + i]).abs();
                 if change > ACCELERATION * 0.5 * DT * f64::from(step) + 1e-9 {
                     peaks.sudden += 1;
+                    peaks.sudden_force = peaks.sudden_force.max(pull.abs() / EFFORT[i % 3]);
                 } else {
                     peaks.force = peaks.force.max(pull.abs() / EFFORT[i % 3]);
                 }
@@ -162,6 +164,7 @@ fn forces_and_their_change_stay_within_the_motors_also_where_policies_switch() {
     }
     assert!(raw.force > 1.2 && cut.rate[1] > 2.0 * GAINS[2], "the attack must be one");
     assert!(guarded.force <= 1.0 + 1e-9, "{}", guarded.force);
+    assert!(guarded.sudden_force < 1.1, "{}", guarded.sudden_force);
     assert!(guarded.sudden < 4800, "{} of 480,000 steps of a joint are too sudden to judge", guarded.sudden);
     assert!(guarded.rate.iter().all(|rate| *rate <= GAINS[2] * (1.0 + 1e-9)), "{:?}", guarded.rate);
     assert!(guarded.moved > 100);

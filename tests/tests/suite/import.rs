@@ -245,8 +245,8 @@ fn floating(imu: &str, sensors: &str) -> String {
         <body name='thigh'><joint name='hip' axis='0 1 0' range='-2 2' limited='true'/>{inertial}
         <body name='shank' pos='0 0 -.3'><joint name='knee' axis='0 1 0' range='-2 2' limited='true'/>{inertial}
         <site name='toe'/></body></body></body></worldbody>
-        <actuator><position joint='hip' kp='20' kv='1' ctrlrange='-3 3' forcerange='-50 50'/>
-        <position joint='knee' kp='30' kv='2' ctrlrange='-3 3' forcerange='-50 50'/></actuator>
+        <actuator><position name='hip' joint='hip' kp='20' kv='1' ctrlrange='-3 3' forcerange='-50 50'/>
+        <position name='knee' joint='knee' kp='30' kv='2' ctrlrange='-3 3' forcerange='-50 50'/></actuator>
         <!-- <velocimeter name='imu_lin_vel' site='toe'/> -->{sensors}</mujoco>"
     )
 }
@@ -332,12 +332,29 @@ fn joints_in_another_order_than_mjlab_s_need_their_own_pose_and_scale() {
     let turned = format!("{PERIOD}[policy]\njoints = [\"knee\", \"hip\"]\n");
     let error = of_mjlab(&[], &robot, &turned).expect_err("another order");
     assert!(
-        error.contains("'joint_names'") && error.contains("state policy.pose and policy.action"),
+        error.contains("'joint_names'") && error.contains("state policy.pose, policy.action in"),
         "{error}"
     );
-    of_mjlab(&[], &robot, &format!("{turned}pose = [-0.2, 0.1]\naction = {{ scale = 0.5 }}\n"))
-        .expect("stated");
+    let stated = format!("{turned}pose = [-0.2, 0.1]\naction = {{ scale = 0.5 }}\n");
+    of_mjlab(&[], &robot, &stated).expect("stated");
+    let scales = [("observation_terms_scale", "1.000,1.000,1.000,1.000,0.050;0.060,1.000,1.000")];
+    let error = of_mjlab(&scales, &robot, &stated).expect_err("scales by joint");
+    assert!(error.contains("state policy.observation in the recipe"), "{error}");
     of_mjlab(&[], &robot, &turned.replace("\"knee\", \"hip\"", "\"hip\", \"knee\"")).expect("the same order");
+}
+
+/// A drive without a range of targets is refused where it is simulated; a robot on legs is told of the guard that is for it.
+#[test]
+fn what_keeps_a_robot_on_legs_from_being_simulated_is_named() {
+    let robot = floating(IMU, SENSORS);
+    let told = |robot: &str| {
+        let snapshot = of_mjlab(&[], robot, PERIOD).expect("imported");
+        nearl_runtime::doctor::told(&snapshot.manifest).expect("notes").join("\n")
+    };
+    let text = told(&robot);
+    assert!(text.contains("add guard = \"drive\"") && !text.contains("have no ctrlrange"), "{text}");
+    let text = told(&robot.replace(" kv='2' ctrlrange='-3 3'", " kv='2'"));
+    assert!(text.contains("actuators 'knee' have no ctrlrange"), "{text}");
 }
 
 /// They had been left out without a word, and the policy saw other numbers.

@@ -131,7 +131,7 @@ impl DriveBox {
     }
 }
 
-/// What is left of `effort` at the end of a tick whose joint accelerates by `acceleration` all along, for the force that its drive begins with.
+/// What the start of a tick may use of `effort`, so that its end keeps it where the joint accelerates by `acceleration` all along.
 pub fn force_left(period: &Period, (stiffness, damping): (f64, f64), effort: f64, acceleration: f64) -> f64 {
     effort - (damping + period.kappa * stiffness * period.dt) * acceleration * period.dt
 }
@@ -146,7 +146,7 @@ impl Joint {
         }
         let falls = self.stiffness * period.dt * v;
         let room = force_left(period, (self.stiffness, self.damping), self.effort, self.acceleration);
-        if room < 0.0 {
+        if room <= 0.0 {
             return (low, high);
         }
         ((falls - room).clamp(low, high), (falls + room).clamp(low, high))

@@ -32,13 +32,6 @@ const FLAT: &str = "observation_terms_flatten_history_dim";
 pub(super) fn recipe(network: &ImportedNetwork, recipes: &[Table]) -> Result<Table, ImportError> {
     let get = |key: &str| network.metadata.get(key).map(String::as_str).filter(|v| !v.is_empty());
     let joints = list(get("joint_names").unwrap_or_default());
-    let orders = recipes.iter().filter_map(|recipe| recipe.get("policy")?.get("joints"));
-    let is_other = orders.last().is_some_and(|stated| *stated != strings(&joints));
-    if is_other && !(states(recipes, "pose") && states(recipes, "action")) {
-        let reason = "a recipe states policy.joints otherwise, and the pose and the scale of the actions beside them are in this order; state policy.pose and \
-                      policy.action in the recipe too, or leave its joints out";
-        return Err(refuse("joint_names", reason.into()));
-    }
     let mut policy = Table::new();
     policy.insert("joints".into(), strings(&joints));
     if let Some(pose) = get("default_joint_pos") {
@@ -54,6 +47,7 @@ pub(super) fn recipe(network: &ImportedNetwork, recipes: &[Table]) -> Result<Tab
     if !states(recipes, "observation") {
         policy.insert("observation".into(), terms(network, &joints)?);
     }
+    in_this_order(&policy, recipes, &joints)?;
     let mut table = Table::from_iter([("policy".to_string(), Value::from(policy))]);
     if let (Some(k), Some(d)) = (get("joint_stiffness"), get("joint_damping")) {
         let by_joint = |key, text| -> Result<Value, ImportError> {
@@ -68,6 +62,38 @@ pub(super) fn recipe(network: &ImportedNetwork, recipes: &[Table]) -> Result<Tab
         table.insert("command".into(), Table::from_iter(command).into());
     }
     Ok(table)
+}
+
+/// Refuses what the metadata states by joint where a recipe states the joints otherwise, and not that.
+fn in_this_order(policy: &Table, recipes: &[Table], joints: &[String]) -> Result<(), ImportError> {
+    let mut orders = recipes.iter().filter_map(|recipe| recipe.get("policy")?.get("joints"));
+    if orders.next_back().is_none_or(|stated| *stated == strings(joints)) {
+        return Ok(());
+    }
+    let is_list = |of: Option<&Value>| of.and_then(|of| of.get("scale")).is_some_and(Value::is_array);
+    let of_joint = |term: &Value| {
+        let name = term.get("term").and_then(Value::as_str).unwrap_or_default();
+        ["joint_pos", "joint_vel", "actions", "last_action"].contains(&name) && is_list(Some(term))
+    };
+    let terms = policy.get("observation").and_then(Value::as_array);
+    let by_joint = [
+        ("pose", policy.contains_key("pose")),
+        ("action", is_list(policy.get("action"))),
+        ("observation", terms.is_some_and(|terms| terms.iter().any(of_joint))),
+    ];
+    let missing = by_joint.into_iter().filter(|(key, is)| *is && !states(recipes, key));
+    let missing: Vec<String> = missing.map(|(key, _)| format!("policy.{key}")).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let keys = missing.join(", ");
+    Err(refuse(
+        "joint_names",
+        format!(
+            "a recipe states policy.joints otherwise, and the metadata has numbers for {keys} in this order; state {keys} in the recipe too, or leave its \
+             joints out"
+        ),
+    ))
 }
 
 /// The terms by name; the command takes the entries that the others leave.

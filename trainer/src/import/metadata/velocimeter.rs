@@ -48,7 +48,7 @@ pub(in super::super) fn place(
 /// The point of the base where the file's velocimeter is; `None` where the base has none.
 fn point(text: &str, robot: &RobotDescription) -> Result<Option<[f64; 3]>, String> {
     let base = robot.bodies.iter().position(|body| body.joints.iter().any(|j| j.kind == JointKind::Free));
-    let all = velocimeters(text);
+    let all = velocimeters(text)?;
     let placed = |name: &str| robot.frames.iter().find(|frame| frame.name == name);
     let named: Vec<_> = all.iter().filter(|v| v.name == MJLABS).collect();
     let frames: Vec<&Frame> = match named[..] {
@@ -85,12 +85,17 @@ struct Velocimeter {
 }
 
 /// The velocimeters that an MJCF names; a URDF has none.
-fn velocimeters(text: &str) -> Vec<Velocimeter> {
-    let Ok(document) = roxmltree::Document::parse(text) else { return Vec::new() };
+///
+/// # Errors
+/// A sentence where the text cannot be searched.
+fn velocimeters(text: &str) -> Result<Vec<Velocimeter>, String> {
+    let document = roxmltree::Document::parse(text).map_err(|e| {
+        format!("it cannot be searched for a velocimeter, by which {TERM} was measured ({e})")
+    })?;
     let all = document.descendants().filter(|element| element.has_tag_name("velocimeter"));
-    all.map(|element| {
+    let all = all.map(|element| {
         let get = |key: &str| element.attribute(key).unwrap_or_default().to_owned();
         Velocimeter { name: get("name"), site: get("site") }
-    })
-    .collect()
+    });
+    Ok(all.collect())
 }
