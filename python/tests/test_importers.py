@@ -1188,7 +1188,7 @@ def test_models_of_rsl_rl_are_read_with_their_normaliser(tmp_path) -> None:
     for model, said in (
         (Model(same, 0.9), "module Model does more than module.mlp: its forward gives .*; where the mlp is all .*" + export.format("module")),
         (Model(Clamped()), r"obs_normalizer \(Clamped\) beside its mlp, which computes something else .*" + export.format("module")),
-        (recurrent, "module Model is recurrent, which is none that layers consist of; train one without memory"),
+        (recurrent, "module Model is recurrent, and only networks without memory are read; train one without"),
         (
             Actor(actor=Model(same)),
             r"module.actor \(Model\) has a normaliser .* give nearl.import_torch\(module.actor\); else " + export.format("module.actor"),

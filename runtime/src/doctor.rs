@@ -334,7 +334,7 @@ fn out_of_reach(m: &Manifest, parts: &Parts, loads: &[holding::Load]) -> Option<
                 false => "nowhere".into(),
             };
             format!(
-                "'{}' {held} (friction {:.3}, weight at most {weight:.3} N m or N, stiffness {stiffness})",
+                "'{}' {held} (friction {:.3}, weight and springs at most {weight:.3} N m or N, stiffness {stiffness})",
                 model.dof_name(i),
                 model.friction()[i],
             )

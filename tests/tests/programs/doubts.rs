@@ -405,7 +405,8 @@ fn drives_that_no_target_lets_make_up_for_friction_are_named() {
     assert!(!text.contains("make up for dry friction"), "{text}");
 }
 
-/// 25 N m take 0.25 rad off the targets of -2.2 to 2.2, beside the arm's weight; without a position limit the robot file's range counts.
+/// By hand: 25 N m of friction take 0.25 rad off the targets of -2.2 to 2.2, the spring's 8.7 and the weight's 0.7 another 0.095; without a position limit the
+/// robot file's range counts.
 #[test]
 fn joints_that_drives_hold_in_a_part_of_their_range_are_named() {
     let folder = tempfile::tempdir().expect("folder");
@@ -414,9 +415,14 @@ fn joints_that_drives_hold_in_a_part_of_their_range_are_named() {
         train(file, &snapshot).expect("a snapshot");
         examine(&snapshot, None).into_iter().find(|check| check.check == "holding").expect("holding")
     };
-    for changes in [&[][..], &[("position = { margin = 0.02 }\n", "")]] {
+    // Where nothing limits the position, the load is looked for up to half a turn.
+    for (changes, from) in [(&[][..], "-1.855"), (&[("position = { margin = 0.02 }\n", "")][..], "-1.817")] {
         let found = holding(&driven(folder.path(), (2.2, 25.0), changes));
-        assert!(found.finding == Finding::Warn && found.text.contains("'elbow' from -1.9"), "{}", found.text);
+        assert!(
+            found.finding == Finding::Warn && found.text.contains(&format!("'elbow' from {from}")),
+            "{}",
+            found.text
+        );
         assert!(!found.text.contains("inf"), "{}", found.text);
         let found = holding(&driven(folder.path(), (2.6, 1.0), changes));
         assert!(found.finding == Finding::Ok, "{}", found.text);
