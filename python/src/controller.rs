@@ -67,7 +67,7 @@ impl Controller {
         py.detach(|| {
             let path =
                 if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
-            let snapshot = Snapshot::load(&path).map_err(errors::snapshot)?;
+            let snapshot = Snapshot::load(&path).map_err(|e| errors::snapshot_in(&path, e))?;
             Controller::new(&snapshot)
         })
     }

@@ -76,7 +76,7 @@ impl Env {
         let (env, manifest) = py.detach(|| {
             let file =
                 if path.is_dir() { run_folder::snapshot_of(&path).map_err(errors::value)? } else { path };
-            let manifest = Snapshot::load(&file).map_err(errors::snapshot)?.manifest;
+            let manifest = Snapshot::load(&file).map_err(|e| errors::snapshot_in(&file, e))?.manifest;
             let env = env::of_task(&manifest, &manifest.task.name).map_err(errors::value)?;
             Ok::<_, PyErr>((env, manifest))
         })?;

@@ -13,6 +13,7 @@ use nearl_trainer::vector::VectorError;
 use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyUserWarning, PyValueError};
 use pyo3::prelude::*;
 use std::io::ErrorKind;
+use std::path::Path;
 
 /// What the user gave is wrong.
 pub(crate) fn value(error: impl std::fmt::Display) -> PyErr {
@@ -78,6 +79,12 @@ pub(crate) fn snapshot(error: SnapshotError) -> PyErr {
         }
         other => value(other),
     }
+}
+
+/// A snapshot in a file, which every sentence names.
+pub(crate) fn snapshot_in(file: &Path, error: SnapshotError) -> PyErr {
+    let (name, text) = (file.display().to_string(), error.to_string());
+    if text.contains(&name) { snapshot(error) } else { value(format!("'{name}': {text}")) }
 }
 
 /// Says as a `UserWarning` what is allowed and hardly meant.
