@@ -419,6 +419,20 @@ fn a_reader_that_closes_the_pipe_ends_the_program_quietly() {
     assert!(output.status.code() == Some(1) && error.contains("standard output"), "{error}");
 }
 
+/// What a plant of a snapshot may be changed in is what it simulates.
+#[test]
+fn a_plant_changes_nothing_of_a_snapshot_s_controller() {
+    let (folder, panda) = (tempfile::tempdir().expect("folder"), panda());
+    let arguments =
+        ["plant", panda.to_str().expect("UTF-8"), "--set", "constraints.guard=true", "--name", "none"];
+    assert_refused(
+        folder.path(),
+        &arguments,
+        b"",
+        &["constraints.guard=true", "what is simulated and no controller"],
+    );
+}
+
 /// `ulimit -f` sends a signal, which ended the program without a word.
 #[test]
 fn a_file_beyond_the_largest_size_is_named() {

@@ -44,7 +44,7 @@ pub(super) struct PlantCommand {
     /// Rehearse the sensor faults in this JSON file.
     #[arg(long)]
     faults: Option<std::path::PathBuf>,
-    /// Overrides of the task file.
+    /// Overrides of the task file; of a snapshot those sections that say what is simulated, as `random.mass=1.2`.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Print JSON.
@@ -122,10 +122,10 @@ impl PlantCommand {
     fn manifest(&self) -> Result<Manifest, Failure> {
         let file = in_run(Path::new(&self.task));
         if file.extension().is_some_and(|e| e == "safetensors") {
-            if !self.set.is_empty() {
-                return Err("--set changes task files, and this is a snapshot; make another one, or give the task file".into());
-            }
-            return Ok(Snapshot::load(&file)?.manifest);
+            let mut snapshot = Snapshot::load(&file)?;
+            let why = "the plant of a snapshot changes what is simulated and no controller";
+            super::eval::changed(&mut snapshot, &self.set, &super::eval::SIMULATED, why)?;
+            return Ok(snapshot.manifest);
         }
         let mut manifest = tasks::load(&self.task, &self.set)?;
         complete(&mut manifest).map_err(|e| of_file(&self.task, &e))?;
