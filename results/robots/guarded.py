@@ -4,11 +4,13 @@ in MuJoCo, and measures what they do: writes guarded/runs.jsonl and guarded/tabl
     .venv/bin/python results/robots/guarded.py FOLDER      # mjcf.sh does it with the packages
 """
 
+import contextlib
 import json
 import pathlib
 import sys
 import tempfile
 import warnings
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
@@ -66,30 +68,33 @@ torque = {{ scale = 1.0 }}
 """
 
 
-def attack(folder: pathlib.Path, root: pathlib.Path, path: pathlib.Path, steps: int) -> dict | None:
-    # A body that touches another is stopped by it, whatever its limits.
+@contextlib.contextmanager
+def without_contacts(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """The robot of a file in a file beside it, in which nothing touches: what touches a robot may stop it harder than any limit."""
     file = path.with_name(f"without_contacts_{path.name}")
     file.write_text(f'<mujoco><include file="{path.name}"/><option><flag contact="disable"/></option></mujoco>')
     try:
-        robot = mujoco.MjModel.from_xml_path(str(file))
-    except ValueError:
-        return None
+        yield file
     finally:
         file.unlink()
-    pairs = motors(robot)
-    if not pairs:
-        return None
-    row = {"file": str(path.relative_to(root)), "joints": len(pairs), "steps": steps}
-    file.write_text(f'<mujoco><include file="{path.name}"/><option><flag contact="disable"/></option></mujoco>')
-    (folder / "task.toml").write_text(task(file, robot, pairs, steps))
-    with warnings.catch_warnings(record=True) as told:
+
+
+def attack(folder: pathlib.Path, root: pathlib.Path, path: pathlib.Path, steps: int) -> dict | None:
+    with without_contacts(path) as file, warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
+        try:
+            robot = mujoco.MjModel.from_xml_path(str(file))
+        except ValueError:
+            return None
+        pairs = motors(robot)
+        if not pairs:
+            return None
+        row = {"file": str(path.relative_to(root)), "joints": len(pairs), "steps": steps}
+        (folder / "task.toml").write_text(task(file, robot, pairs, steps))
         try:
             envs = nearl.make_vec(folder / "task.toml", 1, constraints="task", actions="guarded")
         except (ValueError, OSError) as error:
             return {**row, "refused": str(error).replace(str(folder), "").replace(str(root), "")}
-        finally:
-            file.unlink()
     row["weak"] = any("cannot hold" in str(warning.message) for warning in told)
     n, rng = len(pairs), np.random.default_rng(0)
     ends = np.array([robot.jnt_range[j] if robot.jnt_limited[j] else [-np.inf, np.inf] for _, j in pairs])

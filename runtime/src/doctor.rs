@@ -313,8 +313,8 @@ fn out_of_reach(m: &Manifest, parts: &Parts, loads: &[holding::Load]) -> Option<
     let Parts { model, layout, projector } = parts;
     let drives =
         Parts::drives(m, model, layout.controllable()).ok().filter(|_| m.proposes() && !m.bounds_drives())?;
-    let held = |(k, &i): (usize, &usize)| {
-        let ([low, high], rubs) = doubts::rubbing(m, parts, &drives, k)?;
+    let held = |&i: &usize| {
+        let ([low, high], rubs) = doubts::rubbing(m, parts, &drives, i)?;
         let Drive::Pd { stiffness, .. } = drives[i] else { return None };
         let weight = loads.iter().find(|load| load.dof == i)?.needed;
         let way = rubs + weight / stiffness;
@@ -340,7 +340,7 @@ fn out_of_reach(m: &Manifest, parts: &Parts, loads: &[holding::Load]) -> Option<
             )
         })
     };
-    let joints: Vec<String> = layout.controllable().iter().enumerate().filter_map(held).collect();
+    let joints: Vec<String> = layout.controllable().iter().filter_map(held).collect();
     (!joints.is_empty()).then(|| {
         format!(
             "within the range of their targets drives are sure to hold {}: a joint that begins beyond is led back, and where no brake is found the whole robot \

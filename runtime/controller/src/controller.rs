@@ -31,7 +31,7 @@ mod parts;
 
 pub use dial::{Margin, merge_margins};
 pub use drive_box::force_left;
-pub use parts::{Parts, held_dofs, seen_entries};
+pub use parts::{Parts, held_dofs, seen_entries, target_ranges};
 
 use crate::idm::{AnalyticIdm, LearnedIdm};
 use crate::net::{Activation, Forward, Function};
@@ -48,8 +48,8 @@ use nearl_constraints::{
     ActionLimit, ActionReport, Bounds, Entry, Ledger, Model, Projector, Proposal, RefuseReason, StateLayout,
     Status, Target,
 };
+pub(crate) use parts::idx_q;
 use parts::{check_sizes, halves};
-pub(crate) use parts::{idx_q, target_ranges};
 use std::time::Instant;
 
 /// What is measured at the start of a tick.

@@ -3,7 +3,7 @@
 use nearl_constraints::description::{Command, Motor, mimics};
 use nearl_constraints::{Drive, Dynamics, Kind, MADE_UP_FOR, Projector, REGISTRY};
 
-use crate::controller::{Parts, force_left, held_dofs};
+use crate::controller::{Parts, force_left, held_dofs, target_ranges};
 use crate::snapshot::{Manifest, ModelFormat, PolicyKind};
 use crate::task::IdmKind;
 use crate::unreachable;
@@ -545,21 +545,18 @@ fn undriven(m: &Manifest, parts: &Parts) -> Option<String> {
     })
 }
 
-/// Ends of the target of the `k`-th controllable joint [rad or m], and the part of the way to them that makes up for its dry friction, of a drive of targets.
-pub(super) fn rubbing(m: &Manifest, parts: &Parts, drives: &[Drive], k: usize) -> Option<([f64; 2], f64)> {
-    let i = parts.layout.controllable()[k];
+/// Ends of the target of dof `i` [rad or m], and the part of the way to them that makes up for its dry friction, of a drive of targets.
+pub(super) fn rubbing(m: &Manifest, parts: &Parts, drives: &[Drive], i: usize) -> Option<([f64; 2], f64)> {
     let Drive::Pd { stiffness, .. } = drives[i] else { return None };
-    let motors = Parts::motors(&parts.model, parts.layout.controllable(), drives).ok()?;
-    let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
-    let [one, other] = ends.map(|end| motors.command(k, end));
-    let [low, high] = [one.min(other), one.max(other)];
-    ((high - low).is_finite()).then(|| ([low, high], parts.model.friction()[i] / stiffness))
+    let (model, dofs) = (&parts.model, parts.layout.controllable());
+    let [low, high] = target_ranges(m, model.nv(), dofs, &Parts::motors(model, dofs, drives).ok()?)[i];
+    (high - low).is_finite().then(|| ([low, high], model.friction()[i] / stiffness))
 }
 
 /// Drives whose targets end before they could make up for the dry friction of their joints.
 fn stuck_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String> {
-    let stuck = |(k, &i): (usize, &usize)| {
-        let ([low, high], way) = rubbing(m, parts, drives, k)?;
+    let stuck = |&i: &usize| {
+        let ([low, high], way) = rubbing(m, parts, drives, i)?;
         (2.0 * way > high - low).then(|| {
             let friction = parts.model.friction()[i];
             format!(
@@ -571,7 +568,7 @@ fn stuck_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Option<String
             )
         })
     };
-    let joints: Vec<String> = parts.layout.controllable().iter().enumerate().filter_map(stuck).collect();
+    let joints: Vec<String> = parts.layout.controllable().iter().filter_map(stuck).collect();
     (!joints.is_empty()).then(|| {
         format!(
             "no target of their range has the drives of {} make up for dry friction either way: their limits on acceleration, velocity and position are not \
@@ -593,17 +590,16 @@ pub(super) fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Opti
         return None; // kept inside, and a brake that stays inside is there
     }
     let (dofs, limits) = (layout.controllable(), projector.limits());
-    let motors = Parts::motors(model, dofs, drives).ok()?;
+    let ranges = target_ranges(m, model.nv(), dofs, &Parts::motors(model, dofs, drives).ok()?);
     let (promised, asks) = match m.bounds_drives() {
         true => ("limits on torque are", "a torque limit"),
         false => ("limits on acceleration, velocity and position are", "braking"),
     };
-    let cut = |(k, &i): (usize, &usize)| {
+    let cut = |&i: &usize| {
         // At rest at least, where no speed is known.
         let speed = Some(limits.velocity[i]).filter(|v| v.is_finite() || !m.bounds_drives()).unwrap_or(0.0);
         let reach = drives[i].reach(&m.task.period(), limits.effort[i], speed);
-        let ends = [*m.action_lower.get(motors.place(k))?, *m.action_upper.get(motors.place(k))?];
-        let [low, high] = ends.map(|end| motors.command(k, end));
+        let [low, high] = ranges[i];
         // Without a position limit the robot file's own ends.
         let iq = model.joint_of_dof(i).idx_q;
         let file = [model.lower_position_limit()[iq], model.upper_position_limit()[iq]];
@@ -619,7 +615,7 @@ pub(super) fn cut_targets(m: &Manifest, parts: &Parts, drives: &[Drive]) -> Opti
             )
         })
     };
-    let joints: Vec<String> = dofs.iter().enumerate().filter_map(cut).collect();
+    let joints: Vec<String> = dofs.iter().filter_map(cut).collect();
     let states_range = |motor: &Motor| {
         matches!(motor.command, Command::Position | Command::Pd) && motor.control_range.is_some()
     };

@@ -161,7 +161,7 @@ impl Parts {
 }
 
 /// How far commands to the joints of `dofs` may go, by dof (nv): as far as the plant takes the actions.
-pub(crate) fn target_ranges(m: &Manifest, nv: usize, dofs: &[usize], motors: &Motors) -> Vec<[f64; 2]> {
+pub fn target_ranges(m: &Manifest, nv: usize, dofs: &[usize], motors: &Motors) -> Vec<[f64; 2]> {
     let mut ranges = vec![[f64::NEG_INFINITY, f64::INFINITY]; nv];
     for (k, &i) in dofs.iter().enumerate() {
         let end = |of: &[f64]| of.get(motors.place(k)).map(|end| motors.command(k, *end));
