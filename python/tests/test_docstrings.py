@@ -1,7 +1,6 @@
 """Whoever reads `help(nearl...)` is told the shape of every array, and the unit of every count and quantity."""
 
 import ast
-import importlib.resources
 import importlib.util
 import inspect
 import re
@@ -36,29 +35,34 @@ def functions(tree: ast.Module) -> Iterator[tuple[str, ast.FunctionDef]]:
             yield from ((f"{node.name}.{f.name}", f) for f in node.body if isinstance(f, ast.FunctionDef) and (f.name[0] != "_" or f.name == "__new__"))
 
 
+def is_public(name: str, module: str) -> bool:
+    """Whether `nearl` has this very thing of a module; another may have a name of its own alike."""
+    return getattr(getattr(nearl, name, None), "__module__", "").removeprefix("nearl.") == module.replace("/", ".")
+
+
 def public() -> dict[str, tuple[ast.FunctionDef, str]]:
     """Every public callable of the package with an array in its annotations, and what is written about it."""
     found = {}
-    for module in ("_core.pyi", "controller", "env", "guard", "importers", "link", "pid2", "plant", "projected", "proposer", "vector", "jax", "torch"):
-        name = module if module.endswith(".pyi") else f"{module}.py"
-        file = importlib.resources.files("nearl").joinpath(name)
-        if not file.is_file():
-            continue
-        owner = _core if module == "_core.pyi" else None
+    package = Path(nearl.__file__).parent
+    for file in (package / "_core.pyi", *sorted(package.rglob("*.py"))):
+        module = str(file.relative_to(package).with_suffix(""))
+        owner = _core if file.suffix == ".pyi" else None
         tree = ast.parse(file.read_text())
         classes = {node.name: ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)}
         for label, node in functions(tree):
+            head, _, member = label.partition(".")
+            if owner is None and module not in ("jax", "torch") and not is_public(head, module):
+                continue
             arguments = [*node.args.args, *node.args.kwonlyargs]
             if not any(is_array(a.annotation) for a in arguments) and not is_array(node.returns):
                 continue
             if owner is None:
-                text = (ast.get_docstring(node) or "") + classes.get(label.split(".")[0], "")
+                text = (ast.get_docstring(node) or "") + classes.get(head, "")
             else:
-                head, _, member = label.partition(".")
                 thing = getattr(owner, head if head != "_Report" else "Target", None)
                 value = getattr(thing, member, None) if member and member != "__new__" else thing
                 text = (inspect.getdoc(value) or "") + (inspect.getdoc(thing) or "" if member == "__new__" else "")
-            found[f"{module.removesuffix('.pyi')}: {label}"] = (node, text)
+            found[f"{module}: {label}"] = (node, text)
     return found
 
 
