@@ -4,7 +4,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from networks import NEARL, RNG, Net, TensorProto, f32, helper, numbers_of_its_own, onnx, onnxruntime, planar  # noqa: F401
+from networks import NEARL, RNG, Net, TensorProto, f32, helper, numbers_of_its_own, numpy_helper, onnx, onnxruntime, planar  # noqa: F401
 
 import nearl
 
@@ -194,3 +194,116 @@ def test_robot_recipe_and_output_are_named_as_what_they_are(tmp_path) -> None:
             nearl.import_onnx(path, **files | {"recipe": recipe})
     with pytest.raises(ValueError, match="robot is 3; give the path of a URDF or MJCF file"):
         nearl.import_onnx(path, **files | {"robot": 3})
+
+
+def graph(tmp_path, nodes, constants, n_in: int, n_out: int, opset: int = 17):
+    """A file of nodes (op, inputs, outputs, attributes) from ``obs`` to ``actions``."""
+    made = [helper.make_node(op, inputs, outputs, **attributes) for op, inputs, outputs, attributes in nodes]
+    value = lambda name, n: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, n])  # noqa: E731
+    held = [numpy_helper.from_array(array, name) for name, array in constants.items()]
+    body = helper.make_graph(made, "policy", [value("obs", n_in)], [value("actions", n_out)], held)
+    path = tmp_path / "policy.onnx"
+    onnx.save(helper.make_model(body, opset_imports=[helper.make_opsetid("", opset)], ir_version=8), path)
+    return path
+
+
+def is_refused_or_right(path, n_in: int) -> bool:
+    """Whether a file is taken; one that is gives what onnxruntime gives."""
+    session = onnxruntime.InferenceSession(path)
+    try:
+        policy = nearl.Policy.from_onnx(path)
+    except ValueError:
+        return False
+    for scale in (0.1, 1.0, 10.0):
+        obs = f32(scale * RNG.normal(size=n_in))
+        (want,) = session.run(None, {"obs": obs[None]})
+        np.testing.assert_allclose(policy(obs), want.ravel(), rtol=0, atol=1e-5 * max(1.0, np.abs(want).max()))
+    return True
+
+
+W, I, A = f32(RNG.normal(size=(4, 2))), np.eye(2, dtype=np.float32), np.array([[1, 2], [3, 4]], np.float32)
+X, TO_FLOAT = ("MatMul", ["obs", "W"], ["x"], {}), {"to": TensorProto.FLOAT}
+
+
+@pytest.mark.parametrize(
+    ("nodes", "taken"),
+    [
+        ([X, ("Tanh", ["x"], ["y"], {}), ("Gemm", ["y", "I", "x"], ["actions"], {})], False),
+        ([X, ("Max", ["x", "low", "high"], ["actions"], {})], True),
+        ([X, ("Min", ["low", "x", "high"], ["actions"], {})], True),
+        ([X, ("Max", ["x"], ["actions"], {})], True),
+        ([X, ("Add", ["x", "x"], ["actions"], {})], False),
+        ([X, ("Reshape", ["x", "flat"], ["z"], {}), ("Slice", ["z", "from", "to"], ["s"], {}), ("Clip", ["x", "s"], ["actions"], {})], False),
+        ([X, ("Cast", ["x"], ["i"], {"to": TensorProto.INT64}), ("Cast", ["i"], ["actions"], TO_FLOAT)], False),
+        ([X, ("Cast", ["x"], ["i"], {"to": TensorProto.DOUBLE}), ("Cast", ["i"], ["actions"], TO_FLOAT)], True),
+        ([X, ("Max", ["low", "high", "row"], ["c"], {}), ("Add", ["x", "c"], ["actions"], {})], True),
+        ([("Cast", ["row"], ["i"], {"to": TensorProto.INT64}), ("Cast", ["i"], ["c"], TO_FLOAT), X, ("Add", ["x", "c"], ["actions"], {})], True),
+        ([("Cast", ["row"], ["i"], {"to": TensorProto.BOOL}), ("Cast", ["i"], ["c"], TO_FLOAT), X, ("Add", ["x", "c"], ["actions"], {})], True),
+        ([X, ("Transpose", ["A"], ["S"], {"perm": [0, 1]}), ("MatMul", ["x", "S"], ["actions"], {})], True),
+        ([X, ("Transpose", ["A"], ["S"], {"perm": [1, 0]}), ("MatMul", ["x", "S"], ["actions"], {})], True),
+        ([X, ("Transpose", ["A"], ["S"], {}), ("MatMul", ["x", "S"], ["actions"], {})], True),
+        ([X, ("Unsqueeze", ["row", "last"], ["u"], {}), ("Add", ["u", "row"], ["S"], {}), ("MatMul", ["x", "S"], ["actions"], {})], True),
+        ([X, ("Unsqueeze", ["row", "last"], ["u"], {}), ("Squeeze", ["u"], ["c"], {}), ("Mul", ["x", "c"], ["actions"], {})], True),
+        ([X, ("Reshape", ["x", "column"], ["z"], {}), ("Mul", ["z", "low"], ["y"], {}), ("Reshape", ["y", "flat"], ["actions"], {})], False),
+    ],
+)
+def test_what_is_taken_gives_what_onnxruntime_gives_and_the_rest_is_refused(tmp_path, nodes, taken) -> None:
+    """Each of them reads or leaves out something that a policy's usual graph has not."""
+    constants = {"W": W, "I": I, "A": A, "low": f32([-0.5]), "high": f32([0.25]), "row": f32([0.9, -1.7])}
+    constants |= {"flat": np.array([1, 2]), "column": np.array([-1, 1]), "from": np.array([0, 0]), "to": np.array([1, 1]), "last": np.array([1])}
+    path = graph(tmp_path, nodes, constants, 4, 2)
+    assert is_refused_or_right(path, 4) == taken
+
+
+def test_a_graph_of_any_nodes_is_refused_or_right(tmp_path) -> None:
+    """Chains of nodes drawn at random, with inputs that may be constants, the value before or one from further back."""
+    taken = 0
+    for _ in range(400):
+        nodes, constants, width, values = [], {}, 4, ["obs"]
+
+        def constant(array, held=constants) -> str:
+            name = f"c{len(held)}"
+            held[name] = np.asarray(array)
+            return name
+
+        def row(n: int) -> str:
+            folded = constant(f32(RNG.normal(size=(n,) if RNG.random() < 0.7 else (1, n) if RNG.random() < 0.5 else (1,))))
+            if RNG.random() < 0.3:
+                out = f"f{len(nodes)}"  # noqa: B023
+                op = RNG.choice(["Neg", "Exp", "Identity", "Max", "Add"])
+                inputs = [folded] if op in ("Neg", "Exp", "Identity") else [folded, constant(f32(RNG.normal(size=1)))]
+                inputs += [constant(f32(RNG.normal(size=1)))] * int(op == "Max")
+                nodes.append((op, inputs, [out], {}))  # noqa: B023
+                return out
+            return folded
+
+        for _ in range(RNG.integers(2, 9)):
+            x, out = values[-1], f"x{len(nodes)}"
+            ops = ["Gemm", "MatMul", "Tanh", "Relu", "Add", "Sub", "Mul", "Div", "Clip", "Max", "Min", "Slice", "Sigmoid", "Cast", "Elu"]
+            op, attributes = str(RNG.choice(ops, p=[0.2, 0.15, *[0.05] * 13])), {}
+            back = [v for v in values if v != x and RNG.random() < 0.05]
+            if op in ("Gemm", "MatMul"):
+                wide = int(RNG.integers(1, 5))
+                turned = op == "Gemm" and RNG.random() < 0.5
+                weight = constant(f32(RNG.normal(size=(wide, width) if turned else (width, wide))))
+                inputs = [x, weight] + [row(wide)] * int(op == "Gemm" and RNG.random() < 0.8)
+                attributes = {"transB": 1, "alpha": 0.5} if turned else {}
+                values, width = [], wide
+            elif op in ("Tanh", "Relu", "Sigmoid", "Elu"):
+                inputs = [x]
+            elif op == "Cast":
+                inputs, attributes = [x], TO_FLOAT
+            elif op == "Clip":
+                inputs = [x, constant(f32(-0.4)), constant(f32(0.6))][: int(RNG.integers(1, 4))]
+            elif op == "Slice":
+                width = int(RNG.integers(1, width + 1))
+                inputs, values = [x, constant([0]), constant([width]), constant([1])], []
+            else:
+                inputs = [x, back[0] if back else row(width)]
+                inputs = inputs[::-1] if RNG.random() < 0.4 else inputs
+                inputs += [row(width)] * int(op in ("Max", "Min") and RNG.random() < 0.4)
+            nodes.append((op, inputs, [out], attributes))
+            values.append(out)
+        nodes.append(("Identity", [values[-1]], ["actions"], {}))
+        taken += is_refused_or_right(graph(tmp_path, nodes, constants, 4, width), 4)
+    assert taken > 40, f"{taken} of 400 are taken"

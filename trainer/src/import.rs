@@ -12,6 +12,7 @@ mod chain;
 mod deploy;
 mod elementwise;
 mod file;
+mod fold;
 mod graph;
 mod in_task;
 pub(crate) mod metadata;

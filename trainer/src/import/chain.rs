@@ -22,6 +22,8 @@ pub(super) enum Operation {
     Part(usize, usize),
     /// Entries from the first to before the second, counted from the end where negative, as ONNX does.
     Slice(i64, i64),
+    /// Nothing, where so many entries come.
+    Width(usize),
     /// Nothing: shapes, types, names.
     Same,
 }

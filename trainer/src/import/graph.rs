@@ -2,10 +2,11 @@
 
 use super::ImportError;
 use super::chain::{Live, Operation};
+use super::fold::{cast_to, fold};
 use super::network::ImportedNetwork;
 use super::tensor::Tensor;
 use nearl_runtime::net::Function;
-use rten_onnx::onnx::{AttributeProto, GraphProto, NodeProto};
+use rten_onnx::onnx::{AttributeProto, DataType, GraphProto, NodeProto};
 use std::collections::HashMap;
 use std::path::Path;
 
@@ -100,19 +101,20 @@ impl<'a> Graph<'a> {
         let op = node.op_type.as_deref().unwrap_or_default();
         let first = node.output.first().map_or("", String::as_str);
         let name = node.name.as_deref().filter(|n| !n.is_empty()).unwrap_or(first);
+        let wrong = |reason| ImportError::Node { name: name.into(), op: op.into(), reason };
         let inputs: Vec<Option<Value>> =
             node.input.iter().map(|i| self.values.get(i.as_str()).cloned()).collect();
         let refused = inputs.iter().flatten().find_map(|v| match v {
             Value::Refused(e) => Some(e.clone()),
             _ => None,
         });
-        let result = match refused {
-            Some(error) => Err(error),
-            None => self.evaluate(node, op, name, &inputs).map_err(|reason| ImportError::Node {
-                name: name.into(),
-                op: op.into(),
-                reason,
-            }),
+        // An input that is left out has no name.
+        let unknown =
+            node.input.iter().zip(&inputs).find(|(name, value)| !name.is_empty() && value.is_none());
+        let result = match (refused, unknown) {
+            (Some(error), _) => Err(error),
+            (_, Some((input, _))) => Err(wrong(format!("reads '{input}', which nothing before it computes"))),
+            _ => self.evaluate(node, op, name, &inputs).map_err(wrong),
         };
         for (i, output) in node.output.iter().enumerate() {
             let value = match &result {
@@ -144,12 +146,10 @@ impl<'a> Graph<'a> {
             let attribute = node.attribute.first().ok_or("has no value")?;
             return Ok(vec![Value::Constant(Tensor::of_attribute(attribute, self.beside)?)]);
         }
-        match inputs.first() {
-            Some(Some(Value::Constant(x))) if constants(inputs).is_some() => {
-                let all = constants(inputs).unwrap_or_default();
-                fold(op, x, &all).map(|t| vec![Value::Constant(t)])
-            }
-            _ => self.operation(node, op, name, inputs),
+        match constants(inputs) {
+            Some(all) => fold(&Node { node, op, at: 0, constant: &|i| all.get(i).copied().flatten() })
+                .map(|t| vec![Value::Constant(t)]),
+            None => self.operation(node, op, name, inputs),
         }
     }
 
@@ -164,14 +164,23 @@ impl<'a> Graph<'a> {
         if let ("Mul", [Some(Value::Live(a)), Some(Value::Live(b))]) = (op, inputs) {
             return self.swish(*a, *b, name).map(|v| vec![v]);
         }
-        let at = inputs.iter().position(|v| matches!(v, Some(Value::Live(_))));
-        let Some((at, Some(Value::Live(x)))) = at.map(|at| (at, inputs[at].clone())) else {
-            return Err("has no input that this program knows".into());
-        };
-        let constant = |i: usize| match inputs.get(i) {
-            Some(Some(Value::Constant(t))) => Some(t),
+        let mut lives = inputs.iter().enumerate().filter_map(|(at, value)| match value {
+            Some(Value::Live(x)) => Some((at, *x)),
             _ => None,
+        });
+        let (at, x) = lives.next().ok_or("has no input that this program knows")?;
+        if lives.next().is_some() {
+            return Err("joins two values that both depend on the observation".into());
+        }
+        let last = match op {
+            "Max" | "Min" => usize::MAX,
+            "Add" | "Sub" | "Mul" | "Div" | "Gemm" | "MatMul" => 1,
+            _ => 0,
         };
+        if at > last {
+            return Err(format!("takes its input {at} from the observation, where a constant is read"));
+        }
+        let constant = |i: usize| inputs.get(i).and_then(as_constant);
         let operations = operations(&Node { node, op, at, constant: &constant })?;
         Ok(operations.into_iter().map(|operation| self.push(Some(x), operation, name, op)).collect())
     }
@@ -191,28 +200,25 @@ impl<'a> Graph<'a> {
     }
 }
 
-/// All inputs, if each is a constant.
-fn constants(inputs: &[Option<Value>]) -> Option<Vec<&Tensor>> {
-    let of = |v: &'_ Option<Value>| match v {
-        Some(Value::Constant(_)) => true,
-        Some(_) => false,
-        None => true,
-    };
-    inputs.iter().all(of).then(|| {
-        let tensor = |v| match v {
-            &Some(Value::Constant(ref t)) => Some(t),
-            _ => None,
-        };
-        inputs.iter().filter_map(tensor).collect()
-    })
+/// All inputs, each in its place, if none depends on the observation.
+fn constants(inputs: &[Option<Value>]) -> Option<Vec<Option<&Tensor>>> {
+    let of = |value: &'_ Option<Value>| !matches!(value, Some(Value::Live(_)));
+    inputs.iter().all(of).then(|| inputs.iter().map(as_constant).collect())
 }
 
-/// A node with its constants; `at` is the place of the input that depends on the observation.
-struct Node<'a> {
+fn as_constant(value: &Option<Value>) -> Option<&Tensor> {
+    match value {
+        Some(Value::Constant(tensor)) => Some(tensor),
+        _ => None,
+    }
+}
+
+/// A node with its constants; `at` is the place of the input that depends on the observation, if one does.
+pub(super) struct Node<'a> {
     node: &'a NodeProto,
-    op: &'a str,
+    pub(super) op: &'a str,
     at: usize,
-    constant: &'a dyn Fn(usize) -> Option<&'a Tensor>,
+    pub(super) constant: &'a dyn Fn(usize) -> Option<&'a Tensor>,
 }
 
 impl Node<'_> {
@@ -222,7 +228,7 @@ impl Node<'_> {
     fn float(&self, name: &str, default: f32) -> f64 {
         f64::from(self.attribute(name).and_then(|a| a.f).unwrap_or(default))
     }
-    fn integer(&self, name: &str, default: i64) -> i64 {
+    pub(super) fn integer(&self, name: &str, default: i64) -> i64 {
         self.attribute(name).and_then(|a| a.i).unwrap_or(default)
     }
     /// Input `i` as a constant row.
@@ -233,8 +239,21 @@ impl Node<'_> {
             .ok_or_else(|| format!("has a constant of shape {:?}, where one row is read", tensor.dims))?;
         Ok(row.to_vec())
     }
+    /// How many inputs it has.
+    pub(super) fn width(&self) -> usize {
+        self.node.input.len()
+    }
+
+    /// The constants beside the input that depends on the observation, of a node that takes as many as one likes, reduced to one row.
+    fn others(&self, reduce: fn(f64, f64) -> f64) -> Result<Vec<f64>, String> {
+        let mut all = (0..self.width()).filter(|&i| i != self.at).map(|i| self.row(i).map(Tensor::vector));
+        let first = all.next().ok_or("has one input")??;
+        let fits = |a: &Tensor, b: &Tensor| a.zip(b, reduce).ok_or("has constants of shapes that do not fit");
+        Ok(all.try_fold(first, |row, next| fits(&row, &next?).map_err(String::from))?.values)
+    }
+
     /// Whole numbers from input `i`, else from the attribute.
-    fn integers(&self, i: usize, name: &str) -> Option<Vec<i64>> {
+    pub(super) fn integers(&self, i: usize, name: &str) -> Option<Vec<i64>> {
         let listed = || self.attribute(name).map(|a| a.ints.clone()).filter(|l| !l.is_empty());
         (self.constant)(i).map(Tensor::integers).or_else(listed)
     }
@@ -252,7 +271,16 @@ fn operations(n: &Node<'_>) -> Result<Vec<Operation>, String> {
     let one = |operation| Ok(vec![operation]);
     let function = |f| one(Operation::Function(f));
     match n.op {
-        "Identity" | "Dropout" | "Flatten" | "Squeeze" | "Unsqueeze" | "Cast" => one(Operation::Same),
+        "Identity" | "Flatten" | "Squeeze" | "Unsqueeze" => one(Operation::Same),
+        "Dropout" if n.row(2).is_ok_and(|training| training != [0.0]) => {
+            Err("drops entries, as in training; export the policy in eval mode".into())
+        }
+        "Dropout" => one(Operation::Same),
+        "Cast" => {
+            let kind = DataType(n.integer("to", 0) as i32);
+            let keeps = [DataType::FLOAT, DataType::DOUBLE, DataType::FLOAT16, DataType::BFLOAT16];
+            if keeps.contains(&kind) { one(Operation::Same) } else { Err(cast_to(kind)) }
+        }
         "Reshape" => reshape(n),
         "Tanh" => function(Function::Tanh),
         "Relu" => function(Function::Relu),
@@ -271,17 +299,18 @@ fn operations(n: &Node<'_>) -> Result<Vec<Operation>, String> {
             let w = (n.constant)(1).ok_or("needs a constant matrix")?;
             dense(&w.transposed().ok_or("needs a constant matrix")?, None, 1.0, 1.0).map(|s| vec![s])
         }
-        "Add" => one(Operation::Affine(vec![1.0], n.row(1 - n.at.min(1))?)),
+        "Add" => one(Operation::Affine(vec![1.0], n.row(1 - n.at)?)),
         "Sub" if n.at == 0 => one(Operation::Affine(vec![1.0], n.row(1)?.iter().map(|x| -x).collect())),
         "Sub" => one(Operation::Affine(vec![-1.0], n.row(0)?)),
-        "Mul" => one(Operation::Affine(n.row(1 - n.at.min(1))?, vec![0.0])),
+        "Mul" => one(Operation::Affine(n.row(1 - n.at)?, vec![0.0])),
         "Div" if n.at == 0 => one(Operation::Affine(n.row(1)?.iter().map(|x| 1.0 / x).collect(), vec![0.0])),
         "Neg" => one(Operation::Affine(vec![-1.0], vec![0.0])),
         "Clip" => {
             one(Operation::Clip(n.bound(1, "min", f64::NEG_INFINITY)?, n.bound(2, "max", f64::INFINITY)?))
         }
-        "Max" => one(Operation::Clip(n.row(1 - n.at.min(1))?, vec![f64::INFINITY])),
-        "Min" => one(Operation::Clip(vec![f64::NEG_INFINITY], n.row(1 - n.at.min(1))?)),
+        "Max" | "Min" if n.width() == 1 => one(Operation::Same),
+        "Max" => one(Operation::Clip(n.others(f64::max)?, vec![f64::INFINITY])),
+        "Min" => one(Operation::Clip(vec![f64::NEG_INFINITY], n.others(f64::min)?)),
         "Split" => split(n),
         "Slice" => slice(n),
         _ => Err("is none that a policy's layers consist of (docs/POLICIES.md lists them; a policy of others proposes beside the loop)".into()),
@@ -316,7 +345,8 @@ fn reshape(n: &Node<'_>) -> Result<Vec<Operation>, String> {
     let shape = n.integers(1, "shape").ok_or("needs a constant shape")?;
     let rest = shape.split_last().map_or(&[][..], |(_, rest)| rest);
     if rest.iter().all(|&d| (-1..=1).contains(&d)) {
-        return Ok(vec![Operation::Same]);
+        let last = shape.last().and_then(|&last| usize::try_from(last).ok()).filter(|&last| last > 0);
+        return Ok(vec![last.map_or(Operation::Same, Operation::Width)]);
     }
     Err(format!("makes the shape {shape:?}, where one row is read"))
 }
@@ -362,36 +392,4 @@ fn slice(n: &Node<'_>) -> Result<Vec<Operation>, String> {
         }
     }
     Ok(vec![range.unwrap_or(Operation::Same)])
-}
-
-/// A node of constants alone.
-fn fold(op: &str, x: &Tensor, all: &[&Tensor]) -> Result<Tensor, String> {
-    let map = |f: fn(f64) -> f64| {
-        Ok(Tensor { dims: x.dims.clone(), values: x.values.iter().map(|&v| f(v)).collect() })
-    };
-    let pair = |f: fn(f64, f64) -> f64| {
-        let other = all.get(1).ok_or("has one input")?;
-        x.zip(other, f).ok_or_else(|| "has constants of shapes that do not fit".to_string())
-    };
-    match op {
-        "Add" => pair(|a, b| a + b),
-        "Sub" => pair(|a, b| a - b),
-        "Mul" => pair(|a, b| a * b),
-        "Div" => pair(|a, b| a / b),
-        "Pow" => pair(f64::powf),
-        "Max" => pair(f64::max),
-        "Min" => pair(f64::min),
-        "Sqrt" => map(f64::sqrt),
-        "Exp" => map(f64::exp),
-        "Neg" => map(|v| -v),
-        "Reciprocal" => map(|v| 1.0 / v),
-        "Identity" | "Cast" => Ok(x.clone()),
-        "Squeeze" => Ok(Tensor {
-            dims: x.dims.iter().copied().filter(|&d| d != 1).collect(),
-            values: x.values.clone(),
-        }),
-        "Unsqueeze" => Ok(Tensor { dims: [&[1], &x.dims[..]].concat(), values: x.values.clone() }),
-        "Transpose" => x.transposed().ok_or_else(|| "has no two axes".into()),
-        _ => Err("is none that this program computes from constants".into()),
-    }
 }

@@ -115,6 +115,8 @@ impl Build {
         };
         match operation {
             Operation::Input(..) | Operation::Same => Ok(()),
+            Operation::Width(width) if *width == n => Ok(()),
+            Operation::Width(width) => Err(format!("makes rows of {width} of the {n} entries that come")),
             Operation::Dense { n_in, n_out, weight, bias } => self.dense(*n_in, *n_out, weight, bias),
             Operation::Affine(scale, shift) => {
                 fits(scale).and(fits(shift)).map(|()| self.affine(scale, shift))

@@ -83,16 +83,31 @@ impl Tensor {
         Some(Self { dims: vec![columns, rows], values: (0..rows * columns).map(at).collect() })
     }
 
-    /// Element by element with another constant, either of which may be a single number.
+    /// Element by element with another constant, broadcast as ONNX does; `None` where the shapes do not fit.
     pub(super) fn zip(&self, other: &Self, f: impl Fn(f64, f64) -> f64) -> Option<Self> {
-        let (long, single) =
-            if self.values.len() >= other.values.len() { (self, other) } else { (other, self) };
-        if single.values.len() != 1 && single.values.len() != long.values.len() {
-            return None;
-        }
-        let at = |t: &Self, i: usize| t.values[if t.values.len() == 1 { 0 } else { i }];
-        let values = (0..long.values.len()).map(|i| f(at(self, i), at(other, i))).collect();
-        Some(Self { dims: long.dims.clone(), values })
+        let n = self.dims.len().max(other.dims.len());
+        let dim = |t: &Self, i: usize| (i + t.dims.len()).checked_sub(n).map_or(1, |i| t.dims[i]);
+        let dims: Option<Vec<usize>> = (0..n)
+            .map(|i| match (dim(self, i), dim(other, i)) {
+                (a, b) if a == b || b == 1 => Some(a),
+                (1, b) => Some(b),
+                _ => None,
+            })
+            .collect();
+        let dims = dims?;
+        let count = dims.iter().try_fold(1_usize, |n, &d| n.checked_mul(d)).filter(|&n| n <= MOST)?;
+        // The element of a tensor that stands at the `k`-th place of all: axis by axis from the last, an axis of one at its one place.
+        let at = |t: &Self, k: usize| {
+            let (mut index, mut stride, mut k) = (0, 1, k);
+            for i in (0..n).rev() {
+                let (here, own) = (k % dims[i], dim(t, i));
+                (k, index, stride) =
+                    (k / dims[i], index + if own == 1 { 0 } else { here * stride }, stride * own);
+            }
+            t.values[index]
+        };
+        let values = (0..count).map(|k| f(at(self, k), at(other, k))).collect();
+        Some(Self { dims, values })
     }
 }
 
