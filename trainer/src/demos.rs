@@ -206,8 +206,9 @@ impl Demonstrations {
         if !actions.is_empty() {
             arrays.push(("actions", table(steps, actions)));
         }
-        write_whole(path, &npz::write(&arrays))
-            .map_err(|e| DemoError::Unwritable { file: path.display().to_string(), reason: e.to_string() })
+        let unwritable = |reason| DemoError::Unwritable { file: path.display().to_string(), reason };
+        let bytes = npz::write(&arrays).map_err(unwritable)?;
+        write_whole(path, &bytes).map_err(|e| unwritable(e.to_string()))
     }
 
     /// The same with the columns of `names`, in that order; whatever else the file has is left out.

@@ -95,7 +95,7 @@ fn lengths_that_no_file_holds_are_refused() {
     lengths.shape = vec![2];
     let parts: Vec<(&str, Array)> =
         arrays.iter().map(|(name, array)| (name.as_str(), array.clone())).collect();
-    std::fs::write(&file, npz::write(&parts)).expect("written");
+    std::fs::write(&file, npz::write(&parts).unwrap()).expect("written");
     let said = Demonstrations::load(&file).expect_err("no such episode").to_string();
     assert!(
         said.contains("episode 0 has the length 18446744073709548000; give whole numbers of steps, 1 to 1e9"),
@@ -163,7 +163,7 @@ fn bad_files_are_refused_by_array_column_and_episode() {
         let mut arrays = whole.clone();
         edit(&mut arrays);
         let list: Vec<(&str, Array)> = arrays.iter().map(|(n, a)| (n.as_str(), a.clone())).collect();
-        std::fs::write(&file, npz::write(&list)).expect("file");
+        std::fs::write(&file, npz::write(&list).unwrap()).expect("file");
         Demonstrations::load(&file).expect_err("refused").to_string()
     };
     let numbers = |a: &mut Array, at: usize, x: f64| {
@@ -194,7 +194,7 @@ fn bad_files_are_refused_by_array_column_and_episode() {
         let error = with(edit);
         assert!(error.contains(want), "{error}");
     }
-    let bytes = npz::write(&[("dt", Array { shape: vec![], values: Values::Numbers(vec![1.0]) })]);
+    let bytes = npz::write(&[("dt", Array { shape: vec![], values: Values::Numbers(vec![1.0]) })]).unwrap();
     for cut in 0..bytes.len() {
         assert!(npz::read(&bytes[..cut]).is_err(), "cut after {cut} bytes");
     }

@@ -102,29 +102,30 @@ fn array(bytes: &[u8]) -> Result<Array, String> {
     let n = n.ok_or_else(|| format!("its shape {shape:?} has more entries than a file can hold"))?;
     let width = match kind.as_bytes() {
         [_, b'U', digits @ ..] => {
-            4 * std::str::from_utf8(digits).ok().and_then(|d| d.parse().ok()).unwrap_or(0)
+            let letters = std::str::from_utf8(digits).ok().and_then(|d| d.parse::<usize>().ok());
+            letters.and_then(|letters| letters.checked_mul(4))
         }
-        [_, _, digit @ b'1'..=b'8'] => usize::from(digit - b'0'),
-        _ => 0,
+        [_, _, digit @ b'1'..=b'8'] => Some(usize::from(digit - b'0')),
+        _ => None,
     };
+    let unread = || format!("entries of type '{kind}' are not read; give little-endian numbers or text");
+    let width = width.filter(|width| *width > 0).ok_or_else(unread)?;
     let content = bytes.get(data..).unwrap_or_default();
     if Some(content.len()) != n.checked_mul(width) {
         return Err(format!("it has {} bytes where {n} entries of type '{kind}' are told", content.len()));
     }
-    let parts = content.chunks_exact(width.max(1));
+    let parts = content.chunks_exact(width);
     let integer = |b: &[u8]| b.iter().rev().fold(0u64, |n, b| n << 8 | u64::from(*b));
     let signed = |b: &[u8]| (integer(b) << (64 - 8 * b.len()) as u32) as i64 >> (64 - 8 * b.len()) as u32;
-    let values = match (&kind[..1], &kind[1..2], width) {
-        ("<", "f", 8) => Values::Numbers(parts.map(|b| f64::from_bits(integer(b))).collect()),
-        ("<", "f", 4) => {
+    let values = match (kind.as_bytes()[0], kind.as_bytes()[1], width) {
+        (b'<', b'f', 8) => Values::Numbers(parts.map(|b| f64::from_bits(integer(b))).collect()),
+        (b'<', b'f', 4) => {
             Values::Numbers(parts.map(|b| f64::from(f32::from_bits(integer(b) as u32))).collect())
         }
-        ("<" | "|", "i", _) => Values::Numbers(parts.map(|b| signed(b) as f64).collect()),
-        ("<" | "|", "u" | "b", _) => Values::Numbers(parts.map(|b| integer(b) as f64).collect()),
-        ("<", "U", _) => Values::Words(parts.map(word).collect()),
-        _ => {
-            return Err(format!("entries of type '{kind}' are not read; give little-endian numbers or text"));
-        }
+        (b'<' | b'|', b'i', _) => Values::Numbers(parts.map(|b| signed(b) as f64).collect()),
+        (b'<' | b'|', b'u' | b'b', _) => Values::Numbers(parts.map(|b| integer(b) as f64).collect()),
+        (b'<', b'U', _) => Values::Words(parts.map(word).collect()),
+        _ => return Err(unread()),
     };
     Ok(Array { shape, values })
 }
@@ -137,9 +138,12 @@ fn word(bytes: &[u8]) -> String {
 
 /// The file with these arrays, as `numpy.load` reads it.
 ///
+/// # Errors
+/// One sentence: sizes and places in such a file end at 4 GB.
+///
 /// # Panics
 /// When an array's entries do not fill its shape.
-pub fn write(arrays: &[(&str, Array)]) -> Vec<u8> {
+pub fn write(arrays: &[(&str, Array)]) -> Result<Vec<u8>, String> {
     let (mut out, mut list) = (Vec::new(), Vec::new());
     for (name, array) in arrays {
         let (name, content, place) = (format!("{name}.npy"), bytes_of(array), out.len() as u32);
@@ -155,11 +159,17 @@ pub fn write(arrays: &[(&str, Array)]) -> Vec<u8> {
         let rest = [&name_len[..], &[0; 12], &place.to_le_bytes()].concat();
         list.extend([&CENTRAL.to_le_bytes()[..], &[20, 0], &common, &rest, name.as_bytes()].concat());
     }
+    if out.len() + list.len() >= ELSEWHERE as usize {
+        return Err(format!(
+            "it would have {:.1} GB, and such a file holds 4; write fewer episodes into one",
+            out.len() as f64 / 1e9
+        ));
+    }
     let (place, count) = ((out.len() as u32).to_le_bytes(), (arrays.len() as u16).to_le_bytes());
     let size = (list.len() as u32).to_le_bytes();
     out.extend(list);
     out.extend([&END.to_le_bytes()[..], &[0; 4], &count, &count, &size, &place, &[0, 0]].concat());
-    out
+    Ok(out)
 }
 
 fn bytes_of(array: &Array) -> Vec<u8> {
@@ -201,5 +211,18 @@ mod tests {
         let bytes = [&b"\x93NUMPY\x01\x00"[..], &length, header.as_bytes(), &[0; 64]].concat();
         let said = array(&bytes).map(drop).expect_err("no file has so many");
         assert_eq!(said, "its shape [1099511627776, 1099511627776] has more entries than a file can hold");
+    }
+    #[test]
+    fn a_type_that_is_none_is_refused_as_it_is() {
+        for kind in ["", "b", "<", "<U0", "<U4611686018427387904", "\u{e9}", "<f9", "O"] {
+            let header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': (0,), }}\n");
+            let length = (header.len() as u16).to_le_bytes();
+            let bytes = [&b"\x93NUMPY\x01\x00"[..], &length, header.as_bytes()].concat();
+            let said = array(&bytes).map(drop).expect_err("nobody knows what it holds");
+            assert_eq!(
+                said,
+                format!("entries of type '{kind}' are not read; give little-endian numbers or text")
+            );
+        }
     }
 }
