@@ -424,12 +424,13 @@ fn messages_name_the_frame() {
         (Model::from_urdf_text(mesh).unwrap(), with(&|s| (s.urdf, s.shapes) = (true, Vec::new())));
     let text = limit.rows(&m, &[0]).err().unwrap().to_string();
     assert!(text.contains("'b'") && text.contains("mesh"), "{text}");
-    let bad = mesh.replace("1 1 1", "1 1");
-    assert!(
-        Model::from_urdf_text(&bad.replace("1 1\"", "1 x\""))
-            .err()
-            .unwrap()
-            .to_string()
-            .contains("collision box size is '1 x'")
-    );
+    for (from, to, said) in [
+        ("1 1 1", "1 x", "box size is '1 x', not three numbers"),
+        ("1 1 1", "1 1", "box size is '1 1', not three numbers"),
+        ("<box size=\"1 1 1\"/>", "<sphere radius=\"1 7\"/>", "sphere radius is '1 7', not one number"),
+        ("<collision>", "<collision><origin xyz=\"0 0\"/>", "origin xyz is '0 0', not three numbers"),
+    ] {
+        let text = Model::from_urdf_text(&mesh.replacen(from, to, 1)).err().unwrap().to_string();
+        assert!(text.contains(&format!("link 'a' collision {said}")), "{text}");
+    }
 }
