@@ -140,14 +140,7 @@ impl RowsMessage {
 
     /// Writes the names of the rows, as many as there is room for; a line break within one becomes a space.
     pub fn set_row_names<S: AsRef<str>>(&mut self, names: &[S]) {
-        let mut at = 0;
-        for name in names.iter().map(|name| name.as_ref().replace('\n', " ")) {
-            let Some(room) = self.names.get_mut(at..=at + name.len()) else { break };
-            room[..name.len()].copy_from_slice(name.as_bytes());
-            room[name.len()] = b'\n';
-            at += name.len() + 1;
-        }
-        self.length = at as u64;
+        self.length = write_names(names, &mut self.names) as u64;
     }
 }
 
@@ -197,18 +190,17 @@ fn read_names(bytes: &[u8]) -> Vec<String> {
     if text.is_empty() { Vec::new() } else { text.split('\n').map(str::to_owned).collect() }
 }
 
-/// Writes as many names as there is room for.
-fn write_names<S: AsRef<str>>(names: &[S], bytes: &mut [u8]) {
+/// Writes as many names as there is room for, and says how many bytes they take; a line break within one becomes a space.
+fn write_names<S: AsRef<str>>(names: &[S], bytes: &mut [u8]) -> usize {
     bytes.fill(0);
     let mut at = 0;
-    for name in names.iter().map(AsRef::as_ref) {
-        if at + name.len() + 1 > bytes.len() {
-            break;
-        }
-        bytes[at..at + name.len()].copy_from_slice(name.as_bytes());
-        bytes[at + name.len()] = b'\n';
+    for name in names.iter().map(|name| name.as_ref().replace('\n', " ")) {
+        let Some(room) = bytes.get_mut(at..=at + name.len()) else { break };
+        room[..name.len()].copy_from_slice(name.as_bytes());
+        room[name.len()] = b'\n';
         at += name.len() + 1;
     }
+    at
 }
 
 impl AskedMessage {

@@ -24,7 +24,8 @@ pub(super) const MEMORY_SCHEMA: &str = r#"{
   "properties": {
     "tick": {"type": "integer"}, "modes": {"type": "array", "items": {"type": "integer"}},
     "grid": {"type": "array", "items": {"type": "integer"}}, "braked": {"type": "integer"}, "ramped": {"type": "integer"},
-    "overran": {"type": "boolean"}, "brake_broken": {"type": "boolean"}, "memory": {"type": "array", "items": {"type": "number"}}
+    "overran": {"type": "boolean"}, "brake_broken": {"type": "boolean"},
+    "way": {"type": "array", "items": {"type": "number"}}, "memory": {"type": "array", "items": {"type": "number"}}
   }
 }"#;
 
