@@ -35,6 +35,19 @@ pub fn v_from_mujoco(model: &Model, q: &[f64], mujoco: &[f64], v: &mut [f64]) {
     });
 }
 
+/// Position and velocity of one joint of `q`, `v`, written there in MuJoCo's convention, in Pinocchio's; its quaternion becomes one of length 1.
+pub(crate) fn joint_from_mujoco(joint: &Joint, q: &mut [f64], v: &mut [f64]) {
+    if let Some(at) = quaternion(joint) {
+        q[at..at + 4].rotate_left(1);
+        let length = q[at..at + 4].iter().map(|x| x * x).sum::<f64>().sqrt();
+        q[at..at + 4].iter_mut().for_each(|x| *x /= length);
+    }
+    if joint.nq == 7 {
+        let turned = transposed_times(&rotation(q, joint), read3(v, joint.idx_v));
+        write3(v, joint.idx_v, turned);
+    }
+}
+
 /// MuJoCo velocity from Pinocchio's, at the Pinocchio configuration `q`.
 pub fn v_to_mujoco(model: &Model, q: &[f64], v: &[f64], mujoco: &mut [f64]) {
     mujoco.copy_from_slice(v);
@@ -77,12 +90,15 @@ fn for_each_free(model: &Model, mut f: impl FnMut(&Joint)) {
 
 /// Index of the first quaternion entry of each free and ball joint.
 fn for_each_quaternion(model: &Model, mut f: impl FnMut(usize)) {
-    for j in model.joints() {
-        match (j.nq, j.nv) {
-            (7, 6) => f(j.idx_q + 3),
-            (4, 3) => f(j.idx_q),
-            _ => {}
-        }
+    model.joints().iter().filter_map(quaternion).for_each(&mut f);
+}
+
+/// Index of the first quaternion entry of a free or ball joint.
+fn quaternion(joint: &Joint) -> Option<usize> {
+    match (joint.nq, joint.nv) {
+        (7, 6) => Some(joint.idx_q + 3),
+        (4, 3) => Some(joint.idx_q),
+        _ => None,
     }
 }
 

@@ -222,6 +222,12 @@ pub fn mimics(joint: &str, other: &str, multiplier: f64, offset: f64) -> String 
 }
 
 impl RobotDescription {
+    /// Unit vector of gravity in world axes; `0 0 -1` where the robot has no weight.
+    pub fn down(&self) -> [f64; 3] {
+        let size = self.gravity.iter().map(|g| g * g).sum::<f64>().sqrt();
+        if size > 0.0 { self.gravity.map(|g| g / size) } else { [0.0, 0.0, -1.0] }
+    }
+
     /// All joints in the order of the velocities.
     pub fn joints(&self) -> impl Iterator<Item = &JointDescription> {
         self.bodies.iter().flat_map(|body| &body.joints)

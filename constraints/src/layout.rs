@@ -3,8 +3,9 @@
 //!
 //! Names: `q.<joint>` and `v.<joint>` are the position and velocity of a joint with one degree of
 //! freedom; `q.<joint>.<part>` and `v.<joint>.<part>` are parts of a joint with several (a free base), which
-//! the projector never moves; every other name is free (a goal, a contact force, a camera feature).
+//! the projector never moves (in MuJoCo's convention, [`parts_of`]); every other name is free (a goal, a contact force, a camera feature).
 
+use crate::convention;
 use crate::model::{Joint, Model};
 
 /// What one observation entry is.
@@ -24,6 +25,28 @@ pub enum Entry {
     },
     /// A part of a joint with several degrees of freedom, or anything the robot model does not know.
     Other,
+}
+
+/// Names of the parts of a joint of `nq` configuration entries and `nv` degrees of freedom, as in `q.root.qw` and `v.root.wx`: empty for a joint of
+/// one, and none for a joint that MuJoCo does not have.
+pub fn parts_of(nq: usize, nv: usize) -> (&'static [&'static str], &'static [&'static str]) {
+    const POSITION: [&str; 7] = [".x", ".y", ".z", ".qw", ".qx", ".qy", ".qz"];
+    const VELOCITY: [&str; 6] = [".x", ".y", ".z", ".wx", ".wy", ".wz"];
+    match (nq, nv) {
+        (1, 1) => (&[""], &[""]),
+        (7, 6) => (&POSITION, &VELOCITY),
+        (4, 3) => (&POSITION[3..], &VELOCITY[3..]),
+        _ => (&[], &[]),
+    }
+}
+
+/// A joint of several degrees of freedom of which the observation holds every part.
+#[derive(Clone, Debug)]
+struct Observed {
+    joint: Joint,
+    /// Observation index of each part.
+    position: Vec<usize>,
+    velocity: Vec<usize>,
 }
 
 /// Why a layout was refused. Each message names the entry and the next step.
@@ -76,6 +99,8 @@ pub struct StateLayout {
     state: Vec<usize>,
     controllable: Vec<usize>,
     controllable_state: Vec<usize>,
+    /// Joints of several degrees of freedom.
+    whole: Vec<Observed>,
 }
 
 impl StateLayout {
@@ -128,7 +153,38 @@ impl StateLayout {
         let controllable_state = (0..state.len())
             .filter(|&k| dof_of(entries[state[k]]).is_some_and(|d| dofs.contains(&d)))
             .collect();
-        Ok(Self { names: observation.to_vec(), entries, state, controllable: dofs, controllable_state })
+        let whole =
+            model.joints().iter().filter(|j| j.nv > 1).filter_map(|j| whole(j, observation)).collect();
+        Ok(Self {
+            names: observation.to_vec(),
+            entries,
+            state,
+            controllable: dofs,
+            controllable_state,
+            whole,
+        })
+    }
+
+    /// Writes the positions and velocities of joints that an observation (n_obs) holds into `q` (nq) and `v` (nv); the others stay. Parts of a joint are
+    /// in MuJoCo's convention, and it is written where all of them are there.
+    pub fn read_state(&self, obs: &[f64], q: &mut [f64], v: &mut [f64]) {
+        for (entry, value) in self.entries.iter().zip(obs) {
+            match *entry {
+                Entry::Position { idx_q, .. } => q[idx_q] = *value,
+                Entry::Velocity { dof } => v[dof] = *value,
+                Entry::Other => {}
+            }
+        }
+        for Observed { joint, position, velocity } in &self.whole {
+            position.iter().zip(&mut q[joint.idx_q..]).for_each(|(k, x)| *x = obs[*k]);
+            velocity.iter().zip(&mut v[joint.idx_v..]).for_each(|(k, x)| *x = obs[*k]);
+            convention::joint_from_mujoco(joint, q, v);
+        }
+    }
+
+    /// The first entry of the joint's position and velocity that the observation lacks.
+    pub fn first_unseen(&self, joint: &Joint) -> Option<String> {
+        entries_of(joint).find(|name| !self.names.contains(name))
     }
 
     /// Names of the observation entries (n_obs).
@@ -167,6 +223,21 @@ impl StateLayout {
     pub fn state_entry(&self, k: usize) -> Entry {
         self.entries[self.state[k]]
     }
+}
+
+/// Names of all that is observed of a joint: its position, then its velocity.
+fn entries_of(joint: &Joint) -> impl Iterator<Item = String> {
+    let (position, velocity) = parts_of(joint.nq, joint.nv);
+    let named = |kind: &str, part: &&str| format!("{kind}.{}{part}", joint.name);
+    let position: Vec<String> = position.iter().map(|part| named("q", part)).collect();
+    position.into_iter().chain(velocity.iter().map(|part| named("v", part)).collect::<Vec<_>>())
+}
+
+fn whole(joint: &Joint, observation: &[String]) -> Option<Observed> {
+    let places = entries_of(joint).map(|name| observation.iter().position(|o| *o == name));
+    let mut position: Vec<usize> = places.collect::<Option<_>>()?;
+    let velocity = position.split_off(parts_of(joint.nq, joint.nv).0.len());
+    (!position.is_empty()).then(|| Observed { joint: joint.clone(), position, velocity })
 }
 
 fn dof_of(entry: Entry) -> Option<usize> {

@@ -81,7 +81,7 @@ pub use error::{LimitError, ModelError};
 pub use file::{MAX_TASK_BYTES, MAX_TEXT_BYTES, open_regular, read_bounded, read_task_text, read_text};
 pub use friction::MADE_UP_FOR;
 pub use kinematics::{FrameMotion, Kinematics, PointMotion};
-pub use layout::{Entry, LayoutError, StateLayout};
+pub use layout::{Entry, LayoutError, StateLayout, parts_of};
 pub use ledger::{ActiveRow, BrakeReason, Counts, Ledger, RefuseReason, Rung, Side, Status};
 pub use limit::*;
 pub use model::{FrameId, Joint, Model};

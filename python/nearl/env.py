@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import gymnasium
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import seed_of
+from nearl.arguments import seed_of, task_of
 from nearl.render import Frame, Renderer
 
 
@@ -35,13 +36,20 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  # as Gymnasium declares it
 
-    def __init__(self, task: str, render_mode: str | None = None, width: int = 480, height: int = 480, camera: str | None = None):
+    def __init__(
+        self,
+        task: str | os.PathLike[str],
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str | None = None,
+    ):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode is '{render_mode}'; give 'rgb_array', or leave it out")
         self.render_mode = render_mode
         self._picture = (width, height), camera
         self._renderer: Renderer | None = None
-        self._native = _core.Env(task)
+        self._native = _core.Env(task_of(task))
         self._seeded = self._begun = self._closed = False
         low = self._native.action_low.astype(np.float32)
         high = self._native.action_high.astype(np.float32)

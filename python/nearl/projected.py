@@ -110,7 +110,7 @@ class ProjectedEnv(gymnasium.Env[NDArray[np.float64], NDArray[np.float64]]):
         return self._native
 
 
-def make(task: str, constraints: str | os.PathLike[str] | None = None, actions: str = "state", **kwargs: Any) -> gymnasium.Env[Any, Any]:
+def make(task: str | os.PathLike[str], constraints: str | os.PathLike[str] | None = None, actions: str = "state", **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """The environment of a registered task: with ``constraints`` a :class:`ProjectedEnv`."""
     if constraints is not None:
         return ProjectedEnv(task, constraints, actions, **kwargs)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nearl import _core
-from nearl.arguments import check_numbers, numbers
+from nearl.arguments import check_numbers, numbers, task_of
 
 Floats = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def _in_order(values: Mapping[str, float], entries: Sequence[str]) -> list[float
     return [values[name] for name in entries]
 
 
-def blank(task: str, path: str | os.PathLike[str], actions: bool = False) -> None:
+def blank(task: str | os.PathLike[str], path: str | os.PathLike[str], actions: bool = False) -> None:
     """Writes the robot and the limits of a task as a snapshot without a policy, for a loop whose proposals come from another process.
 
     Args:
@@ -151,4 +151,4 @@ def blank(task: str, path: str | os.PathLike[str], actions: bool = False) -> Non
     Raises:
         ValueError: the task cannot be used so.
     """
-    _core.blank(task, os.fspath(path), actions)
+    _core.blank(task_of(task), os.fspath(path), actions)

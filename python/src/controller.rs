@@ -48,7 +48,7 @@ pub(crate) struct Controller {
     inner: Mutex<Inner>,
     sizes: (usize, usize, usize),
     n_noise: usize,
-    /// A joint whose state the observation lacks though the inverse dynamics needs it.
+    /// What the observation lacks of a joint's state though a tick needs it.
     unseen: Option<String>,
     snapshot: Arc<Snapshot>,
     names: Vec<String>,
@@ -106,10 +106,10 @@ impl Controller {
         noise: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
         let py = obs.py();
-        if let Some(joint) = &self.unseen {
+        if let Some(entry) = &self.unseen {
             return Err(errors::value(format!(
-                "the observation of '{}' has no 'q.{joint}' or no 'v.{joint}', which analytic inverse dynamics or the policy's own \
-                 observation needs; use update(q, v, obs) of the controller",
+                "the observation of '{}' has no '{entry}', which analytic inverse dynamics, a guard or the policy's own observation needs; observe \
+                 it, or use update(q, v, obs) of the controller, with q and v as Env.state has them",
                 self.task
             )));
         }

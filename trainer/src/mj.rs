@@ -51,6 +51,12 @@ pub enum MjError {
         /// What was given.
         got: usize,
     },
+    /// A rotation that is none.
+    #[error("qpos[{index}] to [{}] are 0, and a quaternion has the length 1; give w x y z, 1 0 0 0 where nothing is turned", index + 3)]
+    NoRotation {
+        /// The first of the four.
+        index: usize,
+    },
     /// A state with NaN or infinity in it.
     #[error("{what}[{index}] is {value}: every entry must be finite")]
     NotFinite {
@@ -443,8 +449,25 @@ impl Model {
         }
     }
 
+    /// First entries in `qpos` of the quaternions of free and ball joints.
+    pub(super) fn quaternions(&self) -> impl Iterator<Item = usize> + '_ {
+        let starts = self.0.jnt_type().iter().zip(self.0.jnt_qposadr());
+        starts.filter_map(|(kind, at)| match kind {
+            MjtJoint::mjJNT_FREE => Some(*at as usize + 3),
+            MjtJoint::mjJNT_BALL => Some(*at as usize),
+            _ => None,
+        })
+    }
+
+    /// Its own, or `joint<id>`; with as many `_` behind as it takes to be no other joint's.
     fn joint_name(&self, id: usize) -> String {
-        self.name(MjtObjBase::mjOBJ_JOINT, id).unwrap_or_else(|| format!("joint{id}"))
+        self.name(MjtObjBase::mjOBJ_JOINT, id).unwrap_or_else(|| {
+            let mut name = format!("joint{id}");
+            while self.0.name_to_id(MjtObjBase::mjOBJ_JOINT, &name).is_some() {
+                name.push('_');
+            }
+            name
+        })
     }
 
     fn name(&self, kind: MjtObjBase, id: usize) -> Option<String> {

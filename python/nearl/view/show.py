@@ -1,5 +1,6 @@
 """The page of the live view: a scene with the robot, its proposal and its target, and the panel beside it."""
 
+import os
 import sys
 import time
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nearl.arguments import task_of
 from nearl.render import compiled
 from nearl.view.figure import Figure, led
 from nearl.view.panel import Panel
@@ -61,14 +63,14 @@ class Page:
             camera.look_at, camera.position = tuple(centre), tuple(centre + (0.6 + 1.3 * size) * np.array([0.8, -0.7, 0.35]))
 
 
-def source_of(name: str, task: str | None) -> Source:
+def source_of(name: str, task: str | os.PathLike[str] | None) -> Source:
     """The run folder at ``name`` if there is one, else the loop of that name."""
     if "/" in name and not Path(name).is_dir():
         raise ViewError(f"there is no folder '{name}'; give the run folder of a training (`nearl train --out FOLDER`) or the name of a loop")
-    return Training(Path(name)) if Path(name).is_dir() else Loop(name, task)
+    return Training(Path(name)) if Path(name).is_dir() else Loop(name, None if task is None else task_of(task))
 
 
-def view(name: str, task: str | None = None, port: int = 8080, seconds: float | None = None, rate: float = 20.0) -> int:
+def view(name: str, task: str | os.PathLike[str] | None = None, port: int = 8080, seconds: float | None = None, rate: float = 20.0) -> int:
     """Shows a running loop until it ends, or a training in its run folder, for ``seconds`` at most; returns the number of pictures.
 
     Args:

@@ -161,7 +161,8 @@ fn parse(manifest: &Manifest, format: ModelFormat, model: &Model) -> Result<(Spe
     let joints = model.joints();
     let (start, dt) = (Names::new(model, Own::default(), Place::Start), model.sim_dt() * sub_steps as f64);
     let driven = actuators.iter().map(|actuator| actuator.dof).collect();
-    let mut course = Course::new(dt, driven, base(&joints).map(|joint| (joint.idx_q, joint.idx_v)));
+    let mut course =
+        Course::new(dt, driven, base(&joints).map(|joint| (joint.idx_q, joint.idx_v)), manifest.robot.down());
     course.commands = Commands::read(&task.commands, &start, dt)?;
     course.pushes = Pushes::read(&task.pushes, &joints, &start, dt)?;
     course.random = Random::read(&task.random, model, &actuators, &start)?;

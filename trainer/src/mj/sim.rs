@@ -67,6 +67,11 @@ impl Sim {
     pub fn set_state(&mut self, qpos: &[f64], qvel: &[f64]) -> Result<(), MjError> {
         check("qpos", qpos, self.model.nq())?;
         check("qvel", qvel, self.model.nv())?;
+        let is_none = |at: &usize| qpos[*at..at + 4].iter().all(|x| *x == 0.0);
+        let none = self.model.quaternions().find(is_none);
+        if let Some(index) = none {
+            return Err(MjError::NoRotation { index });
+        }
         // SAFETY: own model and state.
         self.call(|m, d| unsafe { guard::mj_resetData(m, d) })?;
         self.state.qpos_mut().copy_from_slice(qpos);

@@ -33,6 +33,7 @@ pub fn advice(algo: Algorithm, manifest: &Manifest) -> Result<Vec<String>, Train
     let mut lines = nearl_runtime::doctor::advice(&manifest)?;
     lines.extend(vain_penalty(algo, &manifest)?);
     lines.extend(vain_model(algo, &manifest)?);
+    lines.extend(vain_draws(&manifest));
     lines.extend(beginnings(&manifest)?);
     let own = TrainSettings::read(&manifest.task.train).map_err(TrainError::Settings)?.demos;
     if algo.demos().is_some() && !own.file.is_empty() && manifest.proposes() {
@@ -94,6 +95,47 @@ fn vain_model(algo: Algorithm, manifest: &Manifest) -> Result<Option<String>, Tr
             if vain.len() == 1 { "it" } else { "them" }
         )
     }))
+}
+
+/// Commands that are drawn and that the policy does not see, and a curriculum whose level nothing reads.
+fn vain_draws(manifest: &Manifest) -> Vec<String> {
+    let task = &manifest.task;
+    let is_drawn =
+        |value: &toml::Value| value.as_str().is_some_and(|text| text.contains(char::is_alphabetic));
+    let sees = |name: &str| {
+        let entry = format!("command.{name}");
+        task.state.observation.is_empty() || task.state.observation.contains(&entry)
+    };
+    let unseen =
+        task.commands.iter().filter(|(name, value)| *name != "every" && is_drawn(value) && !sees(name));
+    let mut lines: Vec<String> = unseen
+        .map(|(name, _)| {
+            format!(
+                "[commands] {name} is drawn, and the policy does not see it; add \"command.{name}\" to [state] observation, or write one value for all \
+                 episodes"
+            )
+        })
+        .collect();
+    let sections = [
+        &task.commands,
+        &task.pushes,
+        &task.random,
+        &task.noise,
+        &task.delay,
+        &task.reset,
+        &task.reward,
+        &task.cost,
+        &task.termination,
+        &task.metrics,
+    ];
+    let reads_level = |section: &&toml::Table| section.to_string().contains("level");
+    if !task.curriculum.is_empty()
+        && !sections.iter().any(reads_level)
+        && !task.state.observation.iter().any(|name| name == "level")
+    {
+        lines.push("[curriculum] has a level that nothing reads; write it into what is to grow with it, as mass = \"1 + 0.2 * level * uniform\" in [random]".into());
+    }
+    lines
 }
 
 /// A sentence for each of the settings `set` (`key=value`) that none of the algorithms reads.

@@ -4,7 +4,7 @@ use super::dial::Dial;
 use super::{Controller, Excess, Inverse, Noise, Output, State};
 use crate::PolicyKind;
 use crate::normaliser::Normaliser;
-use nearl_constraints::{Entry, LimitSet, Model, StateLayout, Target, end_of_range};
+use nearl_constraints::{LimitSet, Model, StateLayout, Target, end_of_range};
 
 impl Controller {
     /// How far `state` is outside the limits of the controllable joints: the largest excess of a position and of a velocity; less than
@@ -61,30 +61,20 @@ impl Controller {
         self.policy.n_in()
     }
 
-    /// The first joint whose position or velocity the observation lacks although the tick needs it: for analytic inverse dynamics, or for an
-    /// observation that is computed from the state.
+    /// The first entry of a joint's position or velocity that the observation lacks although the tick needs it: of every joint for analytic inverse
+    /// dynamics and for an observation that is computed from the state, of those that are moved for a guard.
     pub fn first_unseen(&self) -> Option<String> {
-        if !(matches!(self.inverse, Inverse::Analytic(_)) || self.foreign.remembers()) {
-            return None;
-        }
-        let entries = self.layout.entries();
-        let is_seen = |dof: usize| {
-            let position = entries.iter().any(|e| matches!(e, Entry::Position { dof: d, .. } if *d == dof));
-            position && entries.contains(&Entry::Velocity { dof })
-        };
-        (0..self.model.nv()).find(|dof| !is_seen(*dof)).map(|dof| self.model.dof_name(dof))
+        let of_all = matches!(self.inverse, Inverse::Analytic(_)) || self.foreign.remembers();
+        let is_needed =
+            |dof: usize| of_all || self.guard.is_some() && self.layout.controllable().contains(&dof);
+        let needed = self.model.joints().iter().filter(|joint| is_needed(joint.idx_v));
+        needed.filter_map(|joint| self.layout.first_unseen(joint)).next()
     }
 
     /// Writes an observation (n_obs) into `state`, and with it the joints' positions and velocities that it holds; the others stay.
     pub fn observed(&self, obs: &[f64], state: &mut State) {
         state.obs.copy_from_slice(obs);
-        for (entry, value) in self.layout.entries().iter().zip(obs) {
-            match *entry {
-                Entry::Position { idx_q, .. } => state.q[idx_q] = *value,
-                Entry::Velocity { dof } => state.v[dof] = *value,
-                Entry::Other => {}
-            }
-        }
+        self.layout.read_state(obs, &mut state.q, &mut state.v);
     }
 
     /// Writes what the policy would see in `state` if it ran in the next tick, before the normaliser (n_seen).

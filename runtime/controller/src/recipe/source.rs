@@ -11,8 +11,8 @@ pub(super) enum Source {
     Position(Vec<(usize, f64)>),
     /// Degrees of freedom.
     Velocity(Vec<usize>),
-    /// Configuration index of the base.
-    Gravity(usize),
+    /// Configuration index of the base, and the unit vector of gravity in the world.
+    Gravity(usize, [f64; 3]),
     /// Degree of freedom of the base, and the point in its axes [m].
     Linear(usize, [f64; 3]),
     /// Degree of freedom of the base.
@@ -43,7 +43,7 @@ impl Source {
                 Self::Position(single()?.into_iter().map(|j| (j.idx_q, from(j))).collect())
             }
             TermKind::JointVel => Self::Velocity(single()?.into_iter().map(|j| j.idx_v).collect()),
-            TermKind::ProjectedGravity => Self::Gravity(base(model)?.idx_q),
+            TermKind::ProjectedGravity => Self::Gravity(base(model)?.idx_q, model.description().down()),
             TermKind::BaseLinVel => Self::Linear(base(model)?.idx_v, term.point.unwrap_or_default()),
             TermKind::BaseAngVel => Self::Angular(base(model)?.idx_v),
             TermKind::Command if !term.value.is_empty() => Self::Constant(term.value.clone()),
@@ -69,7 +69,7 @@ impl Source {
         match self {
             Self::Position(list) => list.len(),
             Self::Velocity(list) | Self::Observed(list) => list.len(),
-            Self::Gravity(_) | Self::Linear(..) | Self::Angular(_) => 3,
+            Self::Gravity(..) | Self::Linear(..) | Self::Angular(_) => 3,
             Self::Constant(values) => values.len(),
             Self::LastAction(n) => *n,
             Self::Phase(_, shifts) => 2 * shifts.len(),
@@ -83,7 +83,7 @@ impl Source {
                 to.iter_mut().zip(list).for_each(|(x, &(iq, from))| *x = state.q[iq] - from)
             }
             Self::Velocity(list) => to.iter_mut().zip(list).for_each(|(x, &dof)| *x = state.v[dof]),
-            Self::Gravity(iq) => to.copy_from_slice(&down(&state.q[iq + 3..iq + 7])),
+            Self::Gravity(iq, down) => to.copy_from_slice(&to_base(&state.q[iq + 3..iq + 7], *down)),
             Self::Linear(dof, [x, y, z]) => {
                 let (v, w) = (&state.v[*dof..dof + 3], &state.v[dof + 3..dof + 6]);
                 let turned = [w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x];
@@ -104,10 +104,15 @@ impl Source {
     }
 }
 
-/// `R(x, y, z, w)^T (0, 0, -1)`.
-fn down(quaternion: &[f64]) -> [f64; 3] {
-    let [x, y, z, w] = [quaternion[0], quaternion[1], quaternion[2], quaternion[3]];
-    [-2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -(1.0 - 2.0 * (x * x + y * y))]
+/// `R^T d` of the unit quaternion `(u, w)`: `d + 2 (u x (u x d) - w (u x d))`.
+fn to_base(quaternion: &[f64], d: [f64; 3]) -> [f64; 3] {
+    let (u, w) = ([quaternion[0], quaternion[1], quaternion[2]], quaternion[3]);
+    let cross = |a: [f64; 3], b: [f64; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let ud = cross(u, d);
+    let uud = cross(u, ud);
+    [0, 1, 2].map(|i| d[i] + 2.0 * (uud[i] - w * ud[i]))
 }
 
 /// A joint with one degree of freedom and one position.

@@ -151,11 +151,18 @@ fn of_another_kind(message: &str) -> Option<String> {
     Some(format!("it is {is}; give {wanted}"))
 }
 
-/// A section that is written as a list, whose entries would be taken for its keys in turn, and what to do.
+/// A section that is written as a list, whose entries would be taken for its keys in turn, or a list that may not be empty, and what to do.
 pub(super) fn listed(table: &toml::Table) -> Option<(String, &'static str)> {
     let sections = ["model", "time", "state", "idm", "policy", "command", "constraints"];
     if let Some(key) = sections.into_iter().find(|key| table.get(*key).is_some_and(toml::Value::is_array)) {
         return Some((key.into(), "it is a list; give keys and their values, as { key = value }"));
+    }
+    let observed = table.get("state").and_then(|state| state.get("observation")?.as_array());
+    if observed.is_some_and(Vec::is_empty) {
+        return Some((
+            "state.observation".into(),
+            "it is empty; name entries, or leave it out, which observes all that the environment has",
+        ));
     }
     let limits = table.get("constraints")?.as_table()?;
     // Names of joints are a list, and so are limits of several frames.

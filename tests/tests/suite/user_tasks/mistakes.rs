@@ -3,6 +3,7 @@
 use nearl_runtime::constraints::{Drive, Model};
 use nearl_runtime::motors::Motors;
 use nearl_trainer::learn::Algorithm;
+use nearl_trainer::mj::{self, ModelFormat};
 use nearl_trainer::train::{Request, Training, complete, train};
 use nearl_trainer::{robot, tasks};
 
@@ -43,6 +44,26 @@ const MISTAKES: &[(&str, &str, &[&str])] = &[
     ),
     ("[reward]", "[rewards]", &["unknown field `rewards`", "did you mean 'reward'?"]),
     ("cart-pole.xml", "cart-poll.xml", &["cart-poll.xml", "cannot be read"]),
+    (
+        "[reward]",
+        "[commands]\na = \"uniform\"\nb = \"command.a\"\n[reward]",
+        &["[commands.b]", "a draw reads no command; its names are uniform, normal and level"],
+    ),
+    (
+        "[reward]",
+        "[curriculum]\nstep = 0.0\nup = \"length > 0.5\"\n[reward]",
+        &["[curriculum.step]", "0 leaves the level where it is"],
+    ),
+    (
+        "[reward]",
+        "[random]\narmature = \"1 + 0.1 * uniform\"\n[reward]",
+        &["[random.armature]", "no joint with a motor has an armature"],
+    ),
+    (
+        "[reward]",
+        "[random]\narmature = { push = \"1.5\" }\n[reward]",
+        &["[random.armature]", "no joint with a motor has an armature"],
+    ),
 ];
 
 #[test]
@@ -59,6 +80,34 @@ fn mistakes_are_named_with_file_and_key() {
     std::fs::write(&file, text.replacen("[termination]\nfell", "[cost]\nfell", 1)).expect("task");
     let message = tasks::load(&file, &[]).map(|_| ()).map_err(|e| e.to_string());
     assert!(message.is_err_and(|m| m.contains("[termination]: only a task with its own [reward]")));
+}
+
+/// Names that stand for two things, a joint that has no name where another is called as it would be, and lists that may not be empty.
+#[test]
+fn names_that_are_given_twice_are_refused_where_they_are_read() {
+    let folder = tempfile::tempdir().expect("folder");
+    let file = edited(folder.path(), "-0.01 * u.squared", "-0.01 * u.squared");
+    let xml = folder.path().join("cart-pole.xml");
+    let text = std::fs::read_to_string(&xml).expect("robot");
+    std::fs::write(&xml, text.replace("name=\"push\"", "name=\"squared\"")).expect("robot");
+    let message = tasks::load(&file, &[]).map(|_| ()).expect_err("two things").to_string();
+    assert!(
+        message.contains("'u.squared' stands for two things; give the joint, body or actuator"),
+        "{message}"
+    );
+    let loose = text.replace("<joint name=\"hinge\"", "<joint name=\"joint2\"").replace(
+        "</worldbody>",
+        "<body pos=\"3 0 0\"><freejoint/><geom size=\".1\" mass=\"1\"/></body></worldbody>",
+    );
+    let model = mj::Model::from_text(&loose, ModelFormat::Mjcf, mj::Options::default()).expect("model");
+    assert_eq!(
+        model.joints().iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>(),
+        ["slider", "joint2", "joint2_"]
+    );
+    std::fs::write(&xml, text).expect("robot");
+    let message =
+        tasks::load(&file, &["state.observation=[]".into()]).map(|_| ()).expect_err("empty").to_string();
+    assert!(message.contains("[state.observation]: it is empty; name entries, or leave it out"), "{message}");
 }
 
 /// So does a cost, where the learner keeps to a limit on it; where it is only counted the training goes on.

@@ -30,6 +30,8 @@ pub(super) struct Course {
     pub(super) driven: Vec<usize>,
     /// First entries of the free base in `qpos` and `qvel`; never read where the base is fixed.
     pub(super) base: (usize, usize),
+    /// Unit vector of gravity in the world.
+    pub(super) down: [f64; 3],
     /// How far the curriculum has come, 0 to 1.
     pub(super) level: f64,
     /// Squared change of the action in this control period.
@@ -44,7 +46,7 @@ pub(super) struct Course {
 
 impl Course {
     /// `drives`: the degree of freedom of each actuator; one that two actuators drive is one.
-    pub(super) fn new(dt: f64, drives: Vec<usize>, base: Option<(usize, usize)>) -> Course {
+    pub(super) fn new(dt: f64, drives: Vec<usize>, base: Option<(usize, usize)>, down: [f64; 3]) -> Course {
         let (n_act, mut driven) = (drives.len(), drives);
         driven.sort_unstable();
         driven.dedup();
@@ -60,6 +62,7 @@ impl Course {
             last_action: vec![0.0; n_act],
             driven,
             base: base.unwrap_or_default(),
+            down,
             level: 1.0,
             action_change: 0.0,
             ticks: 0,

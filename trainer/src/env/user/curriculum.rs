@@ -61,6 +61,12 @@ impl Curriculum {
                 return Err(mistake(format!("curriculum.{key}"), format!("{value} is outside [0, 1]")));
             }
         }
+        if section.step == 0.0 {
+            return Err(mistake(
+                "curriculum.step",
+                "0 leaves the level where it is; give what one episode adds, e.g. 0.02",
+            ));
+        }
         let resolve = |name: &str| {
             let term =
                 name.strip_prefix("reward.").and_then(|name| reward.iter().position(|t| t.name == name));

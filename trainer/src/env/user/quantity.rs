@@ -1,6 +1,7 @@
 //! What a name in an expression stands for.
 
 use crate::mj::{Actuator, Joint, JointKind, Model, Sim};
+use nearl_runtime::constraints::parts_of;
 
 use super::course::Course;
 use super::expression::Expression;
@@ -143,7 +144,7 @@ impl Names {
 
     fn put_joints(&mut self, joints: &[Joint], follows: bool, outcome: bool) {
         for joint in joints {
-            let (positions, velocities) = parts(joint.kind);
+            let (positions, velocities) = parts_of(joint.nq, joint.nv);
             for (k, part) in positions.iter().enumerate() {
                 self.put(format!("q.{}{part}", joint.name), Quantity::Position(joint.idx_q + k));
                 if outcome {
@@ -226,9 +227,17 @@ impl Names {
     /// A sentence; an unknown name comes with the most similar one.
     pub(super) fn compile(&self, text: &str) -> Result<Expression<Quantity>, String> {
         let resolve = |name: &str| {
-            let found = self.0.iter().find(|(n, _)| n == name).map(|(_, q)| *q);
-            found
-                .ok_or_else(|| format!("unknown name '{}'{}", quoted(name), self.near(quoted(name).as_str())))
+            let mut found = self.0.iter().filter(|(n, _)| n == name).map(|(_, q)| *q);
+            let Some(first) = found.next() else {
+                return Err(format!("unknown name '{}'{}", quoted(name), self.near(quoted(name).as_str())));
+            };
+            if found.any(|other| other != first) {
+                return Err(format!(
+                    "'{}' stands for two things; give the joint, body or actuator that makes it so another name in the robot file",
+                    quoted(name)
+                ));
+            }
+            Ok(first)
         };
         Expression::parse(text, resolve).map_err(|e| format!("\"{}\": {e}", quoted(text)))
     }
@@ -236,6 +245,9 @@ impl Names {
     fn near(&self, name: &str) -> String {
         let scored = self.0.iter().map(|(n, _)| (strsim::jaro(n, name), n));
         let is_given = self.0.iter().any(|(n, _)| n.starts_with("command."));
+        if name.starts_with("command.") && self.0.iter().any(|(_, quantity)| *quantity == Quantity::Uniform) {
+            return ", as a draw reads no command; its names are uniform, normal and level".into();
+        }
         if let Some(command) = name.strip_prefix("command.").filter(|_| !is_given) {
             return format!(
                 ", as the task has no section [commands]; write one with a value or a draw for each: {command} = 0.0"
@@ -259,17 +271,6 @@ impl Names {
 /// The joint by which the robot's base floats, if it does.
 pub(super) fn base(joints: &[Joint]) -> Option<&Joint> {
     joints.iter().find(|joint| joint.kind == JointKind::Free)
-}
-
-/// Suffixes of a joint's positions and velocities in MuJoCo's convention.
-pub(super) fn parts(kind: JointKind) -> (&'static [&'static str], &'static [&'static str]) {
-    match kind {
-        JointKind::Slide | JointKind::Hinge => (&[""], &[""]),
-        JointKind::Ball => (&[".qw", ".qx", ".qy", ".qz"], &[".wx", ".wy", ".wz"]),
-        JointKind::Free => {
-            (&[".x", ".y", ".z", ".qw", ".qx", ".qy", ".qz"], &[".x", ".y", ".z", ".wx", ".wy", ".wz"])
-        }
-    }
 }
 
 /// What the simulation was like when the control period began.
@@ -366,7 +367,7 @@ impl Seen<'_> {
                 course.to_base(self.q, [0, 1, 2].map(|i| self.v[course.base.1 + i]))[axis]
             }
             Quantity::BaseAngular(axis) => self.v[course.base.1 + 3 + axis],
-            Quantity::Gravity(axis) => course.to_base(self.q, [0.0, 0.0, -1.0])[axis],
+            Quantity::Gravity(axis) => course.to_base(self.q, course.down)[axis],
             state => self.read_state(state),
         }
     }

@@ -91,13 +91,7 @@ impl Random {
                 ));
             };
             let able = kind.able(model, actuators);
-            if matches!(kind, Kind::Stiffness | Kind::Damping) && able.is_empty() {
-                let reason = "no motor of the robot is a drive with such a gain; take it out, or command the joints 'pd' (factors on the forces of motors are \
-                              'strength')";
-                return Err(mistake(key, reason));
-            }
-            if *kind == Kind::Bumps && model.physique().bumps.is_empty() {
-                let reason = "the floor is flat; give it bumps (scene.floor.bumps, in m), or take this out";
+            if let Some(reason) = kind.none().filter(|_| able.is_empty()) {
                 return Err(mistake(key, reason));
             }
             let names = kind.names(model, actuators);
@@ -191,7 +185,7 @@ impl Draw {
         })?;
         if !able.contains(&at) {
             let reason = format!(
-                "'{entry}' cannot differ in it: it is the world, a body alone whose inertia MuJoCo simplifies, or a motor that is no drive"
+                "'{entry}' cannot differ in it: it is the world, a body alone whose inertia MuJoCo simplifies, a motor that is no drive, or one of a joint without armature"
             );
             return Err(mistake(key, reason));
         }
@@ -210,9 +204,31 @@ impl Kind {
         }
     }
 
-    /// Which entries may differ: every body but the world, centres of mass where MuJoCo counts on none at the joint, and gains of drives.
+    /// Why nothing of the robot may differ in it, and what to do.
+    fn none(self) -> Option<&'static str> {
+        match self {
+            Kind::Stiffness | Kind::Damping => Some(
+                "no motor of the robot is a drive with such a gain; take it out, or command the joints 'pd' (factors on the forces of motors are 'strength')",
+            ),
+            Kind::Bumps => {
+                Some("the floor is flat; give it bumps (scene.floor.bumps, in m), or take this out")
+            }
+            Kind::Armature => Some(
+                "no joint with a motor has an armature; write armature = \"...\" for its joint in the robot file, or take this out",
+            ),
+            Kind::Centre => Some(
+                "MuJoCo simplifies the inertia of every body, which counts on its centre of mass being where it is; take this out",
+            ),
+            _ => None,
+        }
+    }
+
+    /// Which entries may differ: every body but the world, centres of mass where MuJoCo counts on none at the joint, gains of drives, and the armature
+    /// of each joint once.
     fn able(self, model: &Model, actuators: &[Actuator]) -> Vec<usize> {
-        let (n, bias) = (self.names(model, actuators).len(), model.physique().bias);
+        let (n, physique) = (self.names(model, actuators).len(), model.physique());
+        let bias = &physique.bias;
+        let first = |i: usize| actuators.iter().position(|a| a.dof == actuators[i].dof) == Some(i);
         let has_gain =
             |i: &usize, k: usize| bias.get(actuators[*i].control).is_some_and(|bias| bias[k] != 0.0);
         match self {
@@ -220,6 +236,9 @@ impl Kind {
             Kind::Centre => (1..n).filter(|body| !model.is_simple(*body)).collect(),
             Kind::Stiffness => (0..n).filter(|i| has_gain(i, 1)).collect(),
             Kind::Damping => (0..n).filter(|i| has_gain(i, 2)).collect(),
+            Kind::Armature => {
+                (0..n).filter(|i| physique.armature[actuators[*i].dof] != 0.0 && first(*i)).collect()
+            }
             _ => (0..n).collect(),
         }
     }

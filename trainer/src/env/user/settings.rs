@@ -2,11 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use nearl_runtime::constraints::parts_of;
 use nearl_runtime::task::{Task, suggest};
 use serde::Deserialize;
 
 use super::expression::Expression;
-use super::quantity::{Names, Quantity, parts};
+use super::quantity::{Names, Quantity};
 use crate::mj::Joint;
 use crate::scene;
 
@@ -164,7 +165,7 @@ pub(super) fn starts(task: &Task, joints: &[Joint], names: &Names) -> Result<Vec
 fn entry(joints: &[Joint], name: &str, velocity: bool) -> Result<usize, String> {
     let mut known = Vec::new();
     for joint in joints {
-        let (positions, velocities) = parts(joint.kind);
+        let (positions, velocities) = parts_of(joint.nq, joint.nv);
         let (first, parts) = if velocity { (joint.idx_v, velocities) } else { (joint.idx_q, positions) };
         let whole = parts.iter().enumerate().filter(|(_, part)| !part.starts_with(".q"));
         known.extend(whole.map(|(k, part)| (format!("{}{part}", joint.name), first + k)));
