@@ -3,12 +3,11 @@
     pip install ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp ros-rmw-implementation ros-fastdds ros-sensor-msgs     # or a ROS 2 of the system
     python examples/ros2/bridge.py arm policy.safetensors        # beside: nearl run policy.safetensors --plant arm
 
-Positions are commanded (`[command] interface = "position"` in the task file): the projected target is the command, and a brake holds the
-last one. For 50 to 200 Hz: a message through ROS takes a millisecond or two, and now and then ten. Joints are joined by name, whatever
-order the robot publishes them in. Each command answers a measured position and lies within a period's motion of it. Where messages are late or
-come in bunches that is not yet a bound from one command to the next, so the bridge adds one: it moves a command by no more than the speed
-limits allow in the time since the one before, and in one period at most. A late message therefore costs speed. What the network does to commands
-on their way to the robot it cannot know.
+Positions are commanded (`[command] interface = "position"` in the task file): the projected target is the command. Where no answer comes, and
+where the loop says brake, commands go on slower and slower, by what the acceleration limits allow. For 50 to 200 Hz: a message through ROS
+takes a millisecond or two, and now and then ten. Joints are joined by name, whatever order the robot publishes them in. Where messages come in
+bunches, a command waits until the one before has had its period, but for 5 %: speeds may be so much above their limit and no more. What
+the network does to commands on their way to the robot the bridge cannot know.
 """
 
 import math
@@ -29,6 +28,7 @@ except ImportError as error:
     packages = "ros-rclpy==9.1.2 ros-rmw-fastrtps-cpp ros-rmw-implementation ros-fastdds ros-sensor-msgs"
     raise SystemExit(f"bridge.py needs ROS 2, but {error}: pip install {packages}, or source the system's") from None
 
+SHARE = 0.95  # of a period, which a command has at least before the next
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 
 
@@ -40,13 +40,15 @@ class Bridge(Node):
         name: str,
         joints: list[str],
         dt: float,
-        speed: np.ndarray,
+        most: np.ndarray,
         states: str = "joint_states",
         commands: str = "forward_position_controller/commands",
     ):
         super().__init__(f"nearl_{name}".replace("-", "_"))
-        self.joints, self.dt, self.speed, self.turns = joints, dt, speed, {"act": 0, "hold": 0, "brake": 0}
-        self.command: np.ndarray | None = None
+        self.joints, self.dt, self.turns = joints, dt, {"act": 0, "hold": 0, "brake": 0}
+        self.most = most  # rad/s² or m/s², the acceleration limits
+        self.command: np.ndarray | None = None  # sent last, and its mean speed on the way there
+        self.speed = np.zeros(len(joints))
         self.sent = -math.inf  # s, when the last command went out
         observation = [f"q.{joint}" for joint in joints] + [f"v.{joint}" for joint in joints]
         self.plant = nearl.Plant(name, joints, observation, dt, len(joints), watchdog=10 * dt)
@@ -64,14 +66,14 @@ class Bridge(Node):
         self.turns[turn] += 1
         if self.command is None:  # nobody has led it yet
             self.command = np.array(q)
-        self.send(self.command if turn == "brake" else action)
+        slower = np.copysign(np.maximum(np.abs(self.speed) - self.most * self.dt, 0.0), self.speed)
+        self.speed = (action - self.command) / self.dt if turn == "act" else slower
+        self.send(self.command + self.dt * self.speed)
 
-    def send(self, goal: np.ndarray) -> None:
-        """The goal, or what of the way there the speed limits allow since the command before."""
-        now = time.monotonic()
-        reach = self.speed * min(self.dt, now - self.sent)
-        self.command, self.sent = np.clip(goal, self.command - reach, self.command + reach), now
-        self.sender.publish(Float64MultiArray(data=self.command.tolist()))
+    def send(self, command: np.ndarray) -> None:
+        time.sleep(max(0.0, self.sent + SHARE * self.dt - time.monotonic()))
+        self.command, self.sent = command, time.monotonic()
+        self.sender.publish(Float64MultiArray(data=command.tolist()))
 
     def destroy_node(self) -> None:
         self.plant.close()
@@ -82,7 +84,7 @@ def main(name: str, snapshot: str) -> None:
     controller = nearl.Controller.load(snapshot)
     joints = [entry[2:] for entry in controller.obs_names if entry.startswith("q.")]
     rclpy.init()
-    bridge = Bridge(name, joints, controller.dt, controller.limits["velocity"])
+    bridge = Bridge(name, joints, controller.dt, controller.limits["acceleration"])
     try:
         rclpy.spin(bridge)
     except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
