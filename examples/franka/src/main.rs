@@ -140,7 +140,8 @@ fn drive(robot: &franka::Robot, name: &str, settings: &Settings) -> Result<Repor
     let (mut sent, mut time) = ([0.0; N], 0.0);
     let mut control = robot.start_torque_control()?;
     loop {
-        let (measured, _) = control.read_once()?; // 1. measure; this keeps the time
+        let (measured, passed) = control.read_once()?; // 1. measure; this keeps the time, also of periods whose messages were lost
+        time += passed.as_secs_f64();
         let leaving = leave.load(Ordering::Relaxed) || time >= settings.seconds;
         let state = plant.state();
         (state.time, state.bits) = (time, if time == 0.0 { STATE_RESET } else { 0 });
@@ -174,6 +175,5 @@ fn drive(robot: &franka::Robot, name: &str, settings: &Settings) -> Result<Repor
             return Ok(report);
         }
         control.write_once(&Torques::new(torque))?; // 4. actuate
-        time += DT;
     }
 }
