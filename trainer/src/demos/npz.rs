@@ -94,7 +94,8 @@ fn array(bytes: &[u8]) -> Result<Array, String> {
     if entry(&header, "fortran_order")?.starts_with("True") {
         return Err("it is in Fortran order; write numpy.ascontiguousarray of it".into());
     }
-    let kind = entry(&header, "descr")?.trim_start_matches('\'').split('\'').next().unwrap_or_default();
+    let kind = entry(&header, "descr")?.strip_prefix('\'').and_then(|rest| rest.split('\'').next());
+    let kind = kind.ok_or("its entries are of several parts; give numbers or text")?;
     let shape = entry(&header, "shape")?.trim_start_matches('(').split(')').next().unwrap_or_default();
     let sizes = shape.split(',').map(str::trim).filter(|s| !s.is_empty()).map(str::parse::<usize>);
     let shape = sizes.collect::<Result<Vec<_>, _>>().map_err(|e| format!("its shape cannot be read: {e}"))?;

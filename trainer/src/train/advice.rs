@@ -395,6 +395,32 @@ mod tests {
         }
     }
 
+    /// A command that the policy does not see, and a level that nothing reads.
+    #[test]
+    fn draws_that_change_nothing_are_named() {
+        let said = |set: &[&str]| {
+            let set: Vec<String> = set.iter().map(|s| (*s).into()).collect();
+            vain_draws(&tasks::load_with("HalfCheetah-v5", None, &set).expect("task"))
+        };
+        let seen = "state.observation=[\"q.rooty\", \"command.vx\"]";
+        assert_eq!(said(&["commands.vx=\"uniform\""]), [""; 0], "without a list all are observed");
+        assert_eq!(said(&["commands.vx=\"uniform\"", seen]), [""; 0]);
+        assert_eq!(
+            said(&["commands.vx=0.5", "commands.every=2.0", "state.observation=[\"q.rooty\"]"]),
+            [""; 0],
+            "one value"
+        );
+        let lines = said(&["commands.vx=\"uniform\"", "commands.vy=\"normal\"", seen]);
+        assert!(lines.len() == 1 && lines[0].contains("[commands] vy is drawn"), "{lines:?}");
+        let grows = ["curriculum.step=0.1", "curriculum.up=\"length > 0.5\""];
+        let lines = said(&grows);
+        assert!(
+            lines.len() == 1 && lines[0].starts_with("[curriculum] has a level that nothing reads"),
+            "{lines:?}"
+        );
+        assert_eq!(said(&[&grows[..], &["random.mass=\"1 + level * uniform\""]].concat()), [""; 0]);
+    }
+
     #[test]
     fn settings_of_an_inverse_model_that_does_not_learn_are_named() {
         let said = |algo, set: &[&str]| {
