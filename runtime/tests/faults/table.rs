@@ -25,7 +25,7 @@ const BOMBS: &str = "tests/tests/programs/bombs.rs";
 const FRICTION: &str = "tests/tests/suite/friction.rs";
 const SIMULATOR: &str = "tests/tests/suite/limits_in_simulator.rs";
 const OPERATOR: &str = "runtime/tests/suite/limits.rs";
-const MOVING: &str = "constraints/tests/suite/moving.rs";
+const MOVING: &str = "constraints/tests/suite/moving/joints.rs";
 const SYSTEM: &str = "runtime/tests/faults/system.rs";
 
 /// All faults.

@@ -133,7 +133,11 @@ fn vain_draws(manifest: &Manifest) -> Vec<String> {
         && !sections.iter().any(reads_level)
         && !task.state.observation.iter().any(|name| name == "level")
     {
-        lines.push("[curriculum] has a level that nothing reads; write it into what is to grow with it, as mass = \"1 + 0.2 * level * uniform\" in [random]".into());
+        lines.push(
+            "[curriculum] has a level that nothing reads; write it into what is to grow with it, as \
+                    mass = \"1 + 0.2 * level * uniform\" in [random]"
+                .into(),
+        );
     }
     lines
 }

@@ -185,7 +185,8 @@ impl Draw {
         })?;
         if !able.contains(&at) {
             let reason = format!(
-                "'{entry}' cannot differ in it: it is the world, a body alone whose inertia MuJoCo simplifies, a motor that is no drive, or one of a joint without armature"
+                "'{entry}' cannot differ in it: it is the world, a body alone whose inertia MuJoCo simplifies, a motor that is no drive, or \
+                 one of a joint without armature"
             );
             return Err(mistake(key, reason));
         }
