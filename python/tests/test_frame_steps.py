@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from test_guard_steps import arm, task, with_drives
+from unknown_arms import arm, task, with_drives
 
 import nearl
 

@@ -1,6 +1,6 @@
 """Random arms over the physics steps of a period, pushed onto their limits: python results/steps/steps.py [ARMS].
 
-The arms are those of python/tests/test_guard_steps.py. What MuJoCo did is compared with what was promised: speeds and accelerations to 1e-8, positions
+The arms are those of python/tests/unknown_arms.py. What MuJoCo did is compared with what was promised: speeds and accelerations to 1e-8, positions
 to the ends of the ranges at the end of a period. Writes steps.csv; of another number of ARMS than 60 into a folder of that number.
 """
 
@@ -16,7 +16,7 @@ import nearl
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parents[1] / "python/tests"))
-from test_guard_steps import ACCELERATION, SPEED, arm, task, with_drives, with_weak_motors, within_ranges  # noqa: E402
+from unknown_arms import ACCELERATION, SPEED, arm, task, with_drives, with_weak_motors, within_ranges  # noqa: E402
 
 USUAL, TICKS, PUSHED = 60, 600, 25  # arms a setting, ticks of each, ticks of a push
 
