@@ -207,10 +207,14 @@ impl Controller {
         Ok(out)
     }
 
-    /// What `nearl import` and `nearl doctor` say of its robot and limits, a sentence each: limits that nothing holds, friction, targets that are cut.
+    /// What `nearl import` and `nearl doctor` say of its robot and limits, a sentence each: limits that nothing holds, a guard that only a simulator
+    /// has, friction, targets that are cut.
     #[getter]
     fn notes(&self, py: Python<'_>) -> PyResult<Vec<String>> {
-        py.detach(|| doctor::told(&self.snapshot.manifest)).map_err(errors::snapshot)
+        let manifest = &self.snapshot.manifest;
+        let mut notes = py.detach(|| doctor::told(manifest)).map_err(errors::snapshot)?;
+        notes.extend(manifest.without_simulator().map(str::to_owned));
+        Ok(notes)
     }
 
     /// Control period [s].

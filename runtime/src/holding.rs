@@ -33,9 +33,8 @@ pub fn standing(limits: &LimitSet, of: &ConstraintSettings, model: &Model) -> Li
     let mut standing = limits.clone();
     if let Some(line) = of.torque_speed.as_ref().filter(|line| line.soft.is_none()) {
         for (i, effort) in standing.effort.iter_mut().enumerate() {
-            let name = model.dof_name(i);
-            let margin = line.margin.as_ref().and_then(|margin| margin.of(&name)).unwrap_or(0.0);
-            *effort = line.stall.of(&name).map_or(*effort, |stall| effort.min(stall - margin));
+            let margin = line.margin.as_ref().and_then(|margin| margin.at(model, i)).unwrap_or(0.0);
+            *effort = line.stall.at(model, i).map_or(*effort, |stall| effort.min(stall - margin));
         }
     }
     standing

@@ -23,8 +23,14 @@ pub fn snapshot(task: &str, actions: bool) -> Result<Snapshot, VectorError> {
              idm.kind = \"pinocchio\""
         )));
     }
-    if actions {
-        manifest.task.constraints.guard = Guard::Model;
+    let guard = &mut manifest.task.constraints.guard;
+    if actions && matches!(guard, Guard::Simulator) {
+        return Err(VectorError::Unusable(format!(
+            "task '{task}' has guard = \"simulator\", and a loop has no simulator; write guard = true, or \"drive\" for a robot on legs"
+        )));
+    }
+    if actions && guard.is_off() {
+        *guard = Guard::Model;
     }
     complete(&mut manifest)?;
     manifest.algo = BLANK.into();
@@ -97,7 +103,7 @@ pub(crate) fn commands(task: &Task, model: &Model, drive: Drive, dof: usize) -> 
     let (joint, effort) = (model.dof_name(dof), model.effort_limit()[dof]);
     let iq = model.joint_of_dof(dof).idx_q;
     let range = [model.lower_position_limit()[iq], model.upper_position_limit()[iq]];
-    let asked = task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.of(&joint));
+    let asked = task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.at(model, dof));
     let speeds = [Some(model.velocity_limit()[dof]).filter(|x| x.is_finite()), asked];
     let speed = speeds.into_iter().flatten().reduce(f64::max);
     let motor = model.motors().iter().find(|motor| motor.joint == joint);

@@ -45,12 +45,17 @@ pub enum PerJoint {
 }
 
 impl PerJoint {
-    /// The value of a joint by its name; `None` where nothing is said, and for a list by dof.
-    pub fn of(&self, joint: &str) -> Option<f64> {
+    /// The value of a dof; `None` where nothing is said.
+    pub fn at(&self, model: &Model, dof: usize) -> Option<f64> {
+        self.of(&model.joint_of_dof(dof).name, dof)
+    }
+
+    /// The same of the joint that has it, by name.
+    pub fn of(&self, joint: &str, dof: usize) -> Option<f64> {
         match self {
             PerJoint::All(value) => Some(*value),
             PerJoint::Joints(map) => map.get(joint).copied(),
-            PerJoint::Each(_) => None,
+            PerJoint::Each(list) => list.get(dof).copied(),
         }
     }
 

@@ -144,6 +144,11 @@ impl Projector {
         self.backup.forget();
     }
 
+    /// Forgets the stored brake alone: it was verified within other limits.
+    pub fn forget_brake(&mut self) {
+        self.backup.forget();
+    }
+
     /// What the next projection depends on beside its arguments, as plain numbers: the tick before and the stored brake.
     /// For a checkpoint in the middle of an episode.
     pub fn memory(&self) -> Vec<f64> {

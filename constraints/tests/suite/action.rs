@@ -18,7 +18,7 @@ fn limit(text: &str) -> ActionLimit {
 fn excess(s: &ActionSettings, v: &[f64], a: &[f64], before: Option<&[f64]>) -> f64 {
     let sum = |f: fn(f64, f64) -> f64| v.iter().zip(a).map(|(v, a)| f(*v, *a)).sum::<f64>();
     let over = |limit: Option<f64>, x: f64| limit.map_or(f64::NEG_INFINITY, |limit| x - limit);
-    let rate = s.rate.as_ref().and_then(|rate| rate.of("j1")).zip(before);
+    let rate = s.rate.as_ref().and_then(|rate| rate.of("j1", 0)).zip(before);
     let changes = rate.map_or(f64::NEG_INFINITY, |(rate, before)| {
         a.iter().zip(before).map(|(a, b)| (a - b).abs() - rate).fold(f64::NEG_INFINITY, f64::max)
     });

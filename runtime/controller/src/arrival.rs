@@ -40,9 +40,8 @@ struct Line {
 impl Line {
     fn of(m: &Manifest, model: &Model, dof: usize) -> Option<Line> {
         let limit = m.task.constraints.torque_speed.as_ref().filter(|limit| limit.soft.is_none())?;
-        let name = model.dof_name(dof);
-        let (stall, no_load) = (limit.stall.of(&name)?, limit.no_load.of(&name)?);
-        let margin = limit.margin.as_ref().and_then(|margin| margin.of(&name)).unwrap_or(0.0);
+        let (stall, no_load) = (limit.stall.at(model, dof)?, limit.no_load.at(model, dof)?);
+        let margin = limit.margin.as_ref().and_then(|margin| margin.at(model, dof)).unwrap_or(0.0);
         Some(Line { most: stall - margin, slope: stall / no_load })
     }
 

@@ -12,12 +12,13 @@ use rtrb::{Consumer, Producer};
 use crate::clock::{self, Bell};
 use crate::link::torn;
 use crate::link::{
-    ActionMessage, AskedMessage, HealthMessage, Message, ProposalMessage, RobotMessage, RuntimeLink,
-    StateMessage, TallyMessage, TickMessage, TransitionMessage,
+    ActionMessage, AskedMessage, HealthMessage, MAX_JOINTS, Message, ProposalMessage, RobotMessage,
+    RuntimeLink, StateMessage, TallyMessage, TickMessage, TransitionMessage,
 };
 use crate::log::LogQueue;
 use crate::percentiles::percentiles;
 use crate::rt::inbox::{SnapshotInbox, Surroundings};
+use crate::rt::pinned::above;
 use crate::rt::tick::{Build, Record, Sensed};
 use crate::rt::watch::Watch;
 
@@ -289,10 +290,40 @@ fn another(known: &RobotMessage, robot: &RobotMessage) -> Option<String> {
     if robot.dt != known.dt {
         return Some(format!("its control period is {} s, and was {} s", robot.dt, known.dt));
     }
+    if robot.is_lockstep() != known.is_lockstep() {
+        return Some("it waits for the loop where it did not, or the other way round (lockstep)".into());
+    }
     if robot.observation != known.observation {
         return Some("the entries of its observation have other names or another order".into());
     }
-    (robot.limits != known.limits).then(|| "its robot file or its actuators state other limits".into())
+    if robot.limits != known.limits {
+        return Some("its robot file or its actuators state other limits".into());
+    }
+    tighter(known, robot)
+}
+
+/// A limit that a plant states tighter than it did: what the loop runs was compared with the one before.
+fn tighter(known: &RobotMessage, robot: &RobotMessage) -> Option<String> {
+    let names = robot.joint_names();
+    let kinds = [
+        ("velocity", 1.0, robot.velocity, known.velocity),
+        ("acceleration", 1.0, robot.acceleration, known.acceleration),
+        ("torque", 1.0, robot.effort, known.effort),
+        ("highest position", 1.0, robot.q_upper, known.q_upper),
+        ("lowest position", -1.0, robot.q_lower, known.q_lower),
+    ];
+    let of_joint = |(what, sign, is, was): &(&str, f64, [f64; MAX_JOINTS], [f64; MAX_JOINTS]), i: usize| {
+        let was = if known.states_limits() { was[i] } else { sign * f64::INFINITY };
+        above(sign * was, sign * is[i]).then(|| {
+            format!(
+                "it states {what} {} for joint '{}' where it stated {was}: start the loop anew within it",
+                is[i], names[i]
+            )
+        })
+    };
+    robot
+        .states_limits()
+        .then(|| (0..names.len()).find_map(|i| kinds.iter().find_map(|kind| of_joint(kind, i))))?
 }
 
 /// True if the state is of the size and from the plant that were announced.

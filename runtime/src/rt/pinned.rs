@@ -19,6 +19,8 @@ use crate::task::{IdmKind, Task};
 
 /// Numbers that differ by less than this share are the same: a robot file may have been written anew.
 const SAME: f64 = 1e-9;
+/// Periods further apart than this [s] cannot both be within the 1e-9 s that a plant's may differ by.
+const OTHER_PERIOD: f64 = 1e-8;
 /// Kinds whose whole effect is in the box of single joints, or that [`Pinned::ways`] compares. What any other kind asks for is compared
 /// section by section, so that a kind that is new is not loosened without a word.
 const IN_THE_BOX: [&str; 5] = ["position", "velocity", "acceleration", "velocity_profile", "locked"];
@@ -94,7 +96,8 @@ impl Pinned {
         let unusable = |e: SnapshotError| Refusal { verdict: Verdict::of(&e), text: e.to_string() };
         let parts = Parts::new(manifest).map_err(unusable)?;
         let names: Vec<String> = (0..parts.model.nv()).map(|i| parts.model.dof_name(i)).collect();
-        if names != self.joints || manifest.task.time.dt != self.manifest.task.time.dt {
+        let apart = (manifest.task.time.dt - self.manifest.task.time.dt).abs();
+        if names != self.joints || apart > OTHER_PERIOD {
             // Another robot or period altogether: named where the plant is compared, which refuses it.
             return Ok(());
         }
@@ -124,6 +127,11 @@ impl Pinned {
         let keeps = |m: &Manifest| m.guards() || (m.proposes() && m.task.idm.kind == IdmKind::Pinocchio);
         let loses_guard = old.guards() && !keeps(new);
         say(loses_guard, "its actions are not guarded where those of the loop are".into());
+        let loses_drives = old.bounds_drives() && !new.bounds_drives() && !keeps(new);
+        say(
+            loses_drives,
+            "the forces of its drives are not bounded where those of the loop are (guard = \"drive\")".into(),
+        );
         let (kept, brought) = (&self.constraints, &new.task.constraints);
         if let Some(was) = kept.reached
             && brought.reached.is_none_or(|is| above(is, was))
@@ -215,8 +223,37 @@ impl Pinned {
             .collect()
     }
 
+    /// What acts on a joint beside its motor, and what its motor carries with it.
+    fn passive(&self, model: &Model) -> Option<String> {
+        let old = &self.model;
+        let numbers: [(&str, &[f64], &[f64], &str); 6] = [
+            ("damping", model.damping(), old.damping(), "N m s/rad or N s/m"),
+            ("damping of its drive", model.drive_damping(), old.drive_damping(), "N m s/rad or N s/m"),
+            ("stiffness", model.stiffness(), old.stiffness(), "N m/rad or N/m"),
+            ("rest position of its spring", model.spring_reference(), old.spring_reference(), UNITS[0]),
+            ("dry friction", model.friction(), old.friction(), UNITS[3]),
+            ("armature", model.armature(), old.armature(), "kg m² or kg"),
+        ];
+        let other = |i: usize| {
+            let number = numbers.iter().find(|(_, is, was, _)| above(is[i], was[i]) || above(was[i], is[i]));
+            let said = number.map(|(what, is, was, unit)| {
+                format!("{what} {} {unit} where the loop reckons with {}", is[i], was[i])
+            });
+            let rubs = (model.friction_law()[i], model.friction_onset()[i])
+                != (old.friction_law()[i], old.friction_onset()[i]);
+            said.or_else(|| {
+                (rubs && model.friction()[i] > 0.0).then(|| "dry friction that sets in otherwise".into())
+            })
+        };
+        (0..model.nv().min(old.nv()))
+            .find_map(|i| Some(format!("another robot: joint '{}' has {}", self.joints[i], other(i)?)))
+    }
+
     /// The robot that the torque rows and the inverse dynamics are made of, by its motor forces in a few states.
     fn robot(&self, new: &Manifest, model: &Model) -> Option<String> {
+        if let Some(other) = self.passive(model) {
+            return Some(other);
+        }
         let (old, new) = (&self.manifest.robot, &new.robot);
         let same = old.gravity == new.gravity && old.bodies == new.bodies;
         if same && old.frames == new.frames && old.solids == new.solids {

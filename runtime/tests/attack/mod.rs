@@ -275,7 +275,7 @@ impl Twin {
         }
         let period = self.dynamics.period().dt * f64::from(self.steps);
         let most =
-            snapshot.manifest.task.constraints.acceleration.as_ref().and_then(|a| a.limit.of("")).unwrap();
+            snapshot.manifest.task.constraints.acceleration.as_ref().and_then(|a| a.limit.of("", 0)).unwrap();
         for (q, v) in self.q.iter_mut().zip(&mut self.v) {
             *v -= v.signum() * (most * period).min(v.abs());
             *q += period * *v;

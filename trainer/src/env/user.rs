@@ -295,7 +295,8 @@ fn pd_actuators(manifest: &Manifest, model: &Model, wanted: Option<&[String]>) -
     let speed = |name: &str| {
         let stated =
             manifest.robot.joints().find(|joint| joint.name == name).and_then(|joint| joint.velocity);
-        let asked = manifest.task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.of(name));
+        let dof = joints.iter().find(|joint| joint.name == name).map_or(usize::MAX, |joint| joint.idx_v);
+        let asked = manifest.task.constraints.velocity.as_ref().and_then(|v| v.limit.as_ref()?.of(name, dof));
         stated.into_iter().chain(asked).fold(0.0, f64::max)
     };
     // What a policy of actions may send is what it explores; where the model finds the target, a joint may turn on and on.

@@ -54,7 +54,7 @@ impl DriveBox {
     ) -> Result<DriveBox, SnapshotError> {
         let (drives, limits) = (Parts::drives(m, model, dofs)?, projector.limits());
         let motors = Parts::motors(model, dofs, &drives);
-        let rates = m.task.constraints.torque_rate.as_ref().map(|rate| &rate.limit);
+        let rates = m.task.constraints.torque_rate.as_ref();
         let joint = |(k, &dof): (usize, &usize)| {
             let name = model.dof_name(dof);
             let Drive::Pd { stiffness, damping } = drives[dof] else {
@@ -70,7 +70,11 @@ impl DriveBox {
                     "[constraints] guard = \"drive\" has no torque limit to keep for joint '{name}'; add torque = {{ scale = 1.0 }}"
                 )));
             }
-            let rate = rates.and_then(|rate| rate.of(&name)).unwrap_or(f64::INFINITY);
+            let rate = rates.and_then(|rate| {
+                let margin = rate.margin.as_ref().and_then(|margin| margin.at(model, dof)).unwrap_or(0.0);
+                Some(rate.limit.at(model, dof)? - margin)
+            });
+            let rate = rate.unwrap_or(f64::INFINITY);
             let acceleration = Some(limits.acceleration[dof]).filter(|a| a.is_finite()).unwrap_or(0.0);
             let idx_q = model.joint_of_dof(dof).idx_q;
             let at = motors.as_ref().map_err(Clone::clone)?.place(k);

@@ -78,7 +78,8 @@ impl Controller {
         self.given.age = Age::Used;
         if self.kind == PolicyKind::Direct {
             for (mean, value) in self.mean.iter_mut().zip(&self.given.values) {
-                *mean = *value as f32;
+                // A number beyond what the network's precision holds is its largest, and not infinite.
+                *mean = value.clamp(f64::from(f32::MIN), f64::from(f32::MAX)) as f32;
             }
             return;
         }

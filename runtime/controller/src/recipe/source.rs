@@ -35,6 +35,9 @@ impl Source {
         model: &Model,
         layout: &StateLayout,
     ) -> Result<Self, String> {
+        if let Some(key) = unread(term) {
+            return Err(format!("it has {key}, which '{}' does not read; take it out", term.term.name()));
+        }
         let joints = term.joints.as_ref().unwrap_or(&policy.joints);
         let single = || joints.iter().map(|name| one_dof(model, name)).collect::<Result<Vec<_>, _>>();
         Ok(match term.term {
@@ -102,6 +105,28 @@ impl Source {
             }
         }
     }
+}
+
+/// A key of a term that its kind does not read.
+fn unread(term: &Term) -> Option<&'static str> {
+    let reads: &[&str] = match term.term {
+        TermKind::JointPos | TermKind::JointVel => &["joints"],
+        TermKind::BaseLinVel => &["point"],
+        TermKind::Command => &["entries", "value"],
+        TermKind::Observed => &["entries"],
+        TermKind::Constant => &["value"],
+        TermKind::Phase => &["period", "shifts"],
+        TermKind::ProjectedGravity | TermKind::BaseAngVel | TermKind::LastAction => &[],
+    };
+    let has = [
+        ("joints", term.joints.is_some()),
+        ("entries", !term.entries.is_empty()),
+        ("value", !term.value.is_empty()),
+        ("period", term.period.is_some()),
+        ("shifts", !term.shifts.is_empty()),
+        ("point", term.point.is_some()),
+    ];
+    has.into_iter().find(|(key, there)| *there && !reads.contains(key)).map(|(key, _)| key)
 }
 
 /// `R^T d` of the unit quaternion `(u, w)`: `d + 2 (u x (u x d) - w (u x d))`.

@@ -96,20 +96,25 @@ fn weaker(was: &Value, is: &Value) -> bool {
 
 /// A number, or numbers by joint.
 fn number(key: &str, way: Way, was: Option<&Value>, is: Option<&Value>, joints: &[&str]) -> Option<String> {
-    let by_joint = |v: Option<&Value>| v.is_some_and(Value::is_object);
+    let by_joint = |v: Option<&Value>| v.is_some_and(|v| v.is_object() || v.is_array());
+    let length = |v: Option<&Value>| v.and_then(Value::as_array).map(Vec::len);
+    if [length(was), length(is)].into_iter().flatten().any(|n| n != joints.len()) {
+        return Some(format!("another '{key}'"));
+    }
     let none = match (key, way) {
         ("margin", _) => 0.0,
         (_, Way::Loosens) => f64::INFINITY,
         (_, Way::Tightens) => f64::NEG_INFINITY,
     };
-    let of = |v: Option<&Value>, joint: &str| match v {
+    let of = |v: Option<&Value>, i: usize, joint: &str| match v {
         Some(Value::Object(map)) => map.get(joint).and_then(Value::as_f64).unwrap_or(none),
+        Some(Value::Array(list)) => list.get(i).and_then(Value::as_f64).unwrap_or(none),
         other => other.and_then(Value::as_f64).unwrap_or(none),
     };
     let all = [""];
     let joints = if by_joint(was) || by_joint(is) { joints } else { &all };
-    joints.iter().find_map(|joint| {
-        let (was, is) = (of(was, joint), of(is, joint));
+    joints.iter().enumerate().find_map(|(i, joint)| {
+        let (was, is) = (of(was, i, joint), of(is, i, joint));
         let is_looser = match way {
             Way::Loosens => above(is, was),
             Way::Tightens => above(-is, -was),
@@ -144,6 +149,20 @@ mod tests {
         let one = found(json!({"limit": 2.0}), json!({"limit": {"a": 1.0}}));
         assert_eq!(one.unwrap(), "kind: limit of joint 'b' inf where the loop has 2");
         assert_eq!(found(json!({"limit": {"a": 1.0}}), json!({"limit": 1.0})), None);
+    }
+
+    #[test]
+    fn lists_of_numbers_are_compared_dof_by_dof() {
+        let list = json!({"limit": [1.0, 2.0]});
+        assert_eq!(found(list.clone(), json!({"limit": [1.0, 1.5]})), None);
+        assert_eq!(found(list.clone(), json!({"limit": 1.0})), None);
+        assert_eq!(found(list.clone(), json!({"limit": {"a": 1.0, "b": 2.0}})), None);
+        let looser = found(list.clone(), json!({"limit": [1.0, 9.0]}));
+        assert_eq!(looser.unwrap(), "kind: limit of joint 'b' 9 where the loop has 2");
+        assert!(found(list.clone(), json!({"limit": 2.0})).unwrap().contains("joint 'a' 2"));
+        assert!(found(list.clone(), json!({"limit": [1.0]})).is_some(), "of another robot");
+        assert!(found(json!({"margin": [0.1, 0.2]}), json!({"margin": [0.1, 0.1]})).is_some());
+        assert!(found(list, json!({})).unwrap().contains("inf"));
     }
 
     #[test]
