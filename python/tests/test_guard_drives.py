@@ -44,9 +44,10 @@ kind = "{idm}"
 
 
 @pytest.mark.parametrize("idm", ["learned", "pinocchio"])
-def test_the_guard_of_drives_holds_their_forces_and_rates(tmp_path: Path, idm: str) -> None:
+@pytest.mark.parametrize("rate", ["limit = 100.0", "limit = [100.0, 100.0]", "limit = 5000.0, margin = 4900.0", "limit = { a = 100.0, b = 100.0 }"])
+def test_the_guard_of_drives_holds_their_forces_and_rates(tmp_path: Path, idm: str, rate: str) -> None:
     """By MuJoCo's own actuator forces, of targets that jump from end to end."""
-    text = 'guard = "drive"\ntorque = { scale = 0.5 }\ntorque_rate = { limit = 100.0 }\nacceleration = { limit = 20.0 }'
+    text = f'guard = "drive"\ntorque = {{ scale = 0.5 }}\ntorque_rate = {{ {rate} }}\nacceleration = {{ limit = 20.0 }}'
     file = drives(tmp_path, text, idm)
     envs = nearl.make_vec(file, 1, constraints="task", actions="guarded")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))

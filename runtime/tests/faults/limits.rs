@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+use nearl_constraints::description::JointDescription;
 use nearl_constraints::limit::AccelerationSettings;
-use nearl_constraints::{Braking, Model, PerJoint, Soft};
+use nearl_constraints::{Braking, Guard, Model, PerJoint, Soft};
 use nearl_runtime::link::*;
 use nearl_runtime::rt::*;
 use nearl_runtime::task::IdmKind;
@@ -58,7 +59,21 @@ fn loosenings() -> Vec<(&'static str, Change)> {
         }),
         ("physics steps", |m| m.task.time.sim_dt = 0.0005),
         ("another robot", |m| m.robot.bodies.iter_mut().for_each(|body| body.mass *= 1.5)),
+        ("another robot: joint 'panda_joint1' has damping 60", |m| joints(m, |joint| joint.damping = 60.0)),
+        ("another robot: joint 'panda_joint1' has dry friction 3", |m| {
+            joints(m, |joint| joint.friction = 3.0)
+        }),
+        ("another robot: joint 'panda_joint1' has armature 0.5", |m| joints(m, |joint| joint.armature = 0.5)),
+        // A period that is the plant's but for rounding is the loop's.
+        ("velocity of joint 'panda_joint1'", |m| {
+            m.task.time.dt += 1e-13;
+            m.task.constraints.velocity.as_mut().unwrap().scale = Some(1.0);
+        }),
     ]
+}
+
+fn joints(m: &mut Manifest, change: fn(&mut JointDescription)) {
+    m.robot.bodies.iter_mut().flat_map(|body| &mut body.joints).for_each(change);
 }
 
 #[test]
@@ -108,6 +123,19 @@ fn fault_38_a_pushed_snapshot_may_tighten_the_limits_but_never_loosen_them() {
     let text =
         Pinned::of(&first.manifest, "here").unwrap().admit(&with(2, learned).manifest).unwrap_err().text;
     assert!(text.contains("learned inverse model"), "{text}");
+
+    let drives = |guard: Guard| {
+        let mut manifest = first.manifest.clone();
+        manifest.policy = PolicyKind::Direct;
+        manifest.task.command =
+            toml::from_str("interface = \"pd\"\nstiffness = 50.0\ndamping = 5.0").unwrap();
+        manifest.task.constraints.guard = guard;
+        manifest
+    };
+    let pinned = Pinned::of(&drives(Guard::Drive), "here").unwrap();
+    assert!(pinned.admit(&drives(Guard::Drive)).is_ok());
+    let text = pinned.admit(&drives(Guard::Off)).unwrap_err().text;
+    assert!(text.contains("the forces of its drives are not bounded where those of the loop are"), "{text}");
 
     let tighter: fn(&mut Manifest) = |m| {
         m.task.constraints.velocity.as_mut().unwrap().scale = Some(0.5);
