@@ -81,12 +81,12 @@ class Env(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         unknown = options.keys() - {"qpos", "qvel", "goal"}
         if unknown:
             raise ValueError(f"reset options {sorted(unknown)} are not known; use 'qpos', 'qvel' or 'goal'")
-        if "goal" in options:
-            self._native.goal = options["goal"]
-            obs = self._native.observe()
         if "qpos" in options or "qvel" in options:
             qpos = options.get("qpos", self._native.qpos)
             obs = self._native.set_state(qpos, options.get("qvel", self._native.qvel))
+        if "goal" in options:  # last, as a state begins an episode, which draws one
+            self._native.goal = options["goal"]
+            obs = self._native.observe()
         return obs
 
     def step(self, action: ArrayLike) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:

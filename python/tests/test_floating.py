@@ -103,3 +103,22 @@ def test_a_rotation_that_is_none_is_refused(tmp_path) -> None:
     qpos = np.concatenate([[0, 0, 1], np.zeros(4), np.zeros(2)])
     with pytest.raises(ValueError, match=r"qpos\[3\] to \[6\] are 0, and a quaternion has the length 1"):
         env.set_state(qpos, np.zeros(8))
+
+
+def test_a_goal_beside_a_state_stays_and_a_cost_is_of_what_the_action_did(tmp_path) -> None:
+    """A state begins an episode, which draws commands; a push comes after the step that reward and cost are of."""
+    (tmp_path / "cart.xml").write_text(
+        '<mujoco><option timestep="0.02"/><worldbody><body><joint name="j" type="slide" axis="1 0 0" range="-9 9"/>'
+        '<geom size=".1" mass="1"/></body></worldbody><actuator><motor name="j" joint="j" ctrlrange="-1 1"/></actuator></mujoco>'
+    )
+    (tmp_path / "cart.toml").write_text(
+        'name = "cart"\n[model]\nmjcf = "cart.xml"\n[time]\ndt = 0.02\nsim_dt = 0.02\nmax_episode_steps = 50\n[commands]\nx = "uniform"\n'
+        '[pushes]\nevery = 0.02\njoints = "2.0"\n[reward]\nspeed = "v.j"\n[cost]\nspeed = "v.j"\n[constraints]\n[idm]\nkind = "learned"\n'
+    )
+    env = nearl.Env(tmp_path / "cart.toml")
+    names = env.native.obs_names
+    obs, _ = env.reset(seed=0, options={"goal": [0.5], "qpos": [0.2], "qvel": [0.0]})
+    assert (obs[names.index("command.x")], obs[names.index("q.j")]) == (0.5, 0.2)
+    for _ in range(5):
+        _, reward, _, _, info = env.step(np.array([0.3]))
+        assert info["cost"] == reward, (info, reward)

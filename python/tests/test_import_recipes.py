@@ -217,6 +217,43 @@ def test_a_deployment_of_unitree_is_a_recipe(tmp_path) -> None:
     refused(("step_dt: 0.02", "*alias"), "it is no deploy.yaml")
 
 
+def test_clips_and_joints_of_a_deployment_are_those_of_unitree(tmp_path) -> None:
+    """Their clip is of targets, ``clip(scale x output + offset)``, and ``joint_ids`` number the policy's joints."""
+    files = planar(tmp_path)
+    names = ["joint0", "joint1", "joint2"]
+    deploy = """joint_ids_map: [2, 0, 1]
+step_dt: 0.01
+stiffness: [40.0, 41.0, 42.0]
+damping: [2.0, 2.1, 2.2]
+default_joint_pos: [0.3, 0.1, 0.2]
+actions:
+  JointPositionAction: {clip: [[0.2, 0.6], [0.0, 0.15], [-1.0, 0.25]], scale: [0.5, -0.6, 0.7], offset: [0.3, 0.1, 0.2]}
+observations:
+  joint_pos_rel: {params: {asset_cfg: {joint_ids: [1, 0]}}, clip: null, scale: 1.0, history_length: 1}
+"""
+    (tmp_path / "deploy.yaml").write_text(deploy)
+    weight = f32(3.0 * np.eye(2, 3))
+    path = Net(2).add("Gemm", weight).save(tmp_path / "policy.onnx", 3)
+    controller = nearl.import_onnx(path, robot=files["robot"], recipe=tmp_path / "deploy.yaml")
+    order, scale, offset = [2, 0, 1], np.array([0.5, -0.6, 0.7]), np.array([0.3, 0.1, 0.2])
+    for q in RNG.uniform(-0.4, 0.4, size=(20, 3)):
+        controller.reset()
+        seen = (q[order] - offset)[[1, 0]]
+        target = np.clip(scale * (seen @ weight) + offset, [0.2, 0.0, -1.0], [0.6, 0.15, 0.25])
+        want = np.zeros(3)
+        want[order] = target
+        action, _ = controller.update(q, np.zeros(3), np.concatenate([q, np.zeros(3)]))
+        np.testing.assert_allclose(action, want, atol=1e-5)
+    assert [f"q.{name}" for name in names] == controller.obs_names[:3]
+    with_last = deploy + "  last_action: {params: {}, clip: null, scale: 1.0, history_length: 1}\n"
+    (tmp_path / "deploy.yaml").write_text(with_last)
+    with pytest.raises(ValueError, match="cuts targets that the policy sees uncut as its last action"):
+        nearl.import_onnx(path, robot=files["robot"], recipe=tmp_path / "deploy.yaml")
+    (tmp_path / "deploy.yaml").write_text(deploy.replace("[1, 0]", "[1, 7]"))
+    with pytest.raises(ValueError, match="joint_ids of 'joint_pos_rel' names a joint that the policy does not have"):
+        nearl.import_onnx(path, robot=files["robot"], recipe=tmp_path / "deploy.yaml")
+
+
 def test_the_metadata_of_mjlab_is_a_recipe(tmp_path) -> None:
     path = Net(12).gemm(12, 3).save(tmp_path / "policy.onnx", 3)
     model = onnx.load(path)

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from conftest import ROOT, planar_urdf
 from networks import RNG, Hardtanh, LayerNorm, Linear, Sequential, Tanh, numbers_of_its_own, ppo  # noqa: F401
 
 import nearl
@@ -250,3 +250,34 @@ def test_what_else_a_model_of_stable_baselines_does_is_refused_by_name() -> None
     with pytest.raises(ValueError, match="'vec.pkl' and no VecNormalize"):
         del policy.features_extractor
         nearl.import_sb3(SimpleNamespace(policy=policy, action_space=box), "vec.pkl", task="HalfCheetah-v5")
+
+
+def test_outputs_that_a_recipe_reads_are_cut_as_the_model_cuts_them(tmp_path) -> None:
+    """A mean of 3 is an action of 1 there, of which the recipe makes a target: no motor cuts at an output of 1."""
+    (tmp_path / "arm.urdf").write_text(planar_urdf())
+    recipe = '[time]\ndt = 0.01\n[command]\ninterface = "pd"\nstiffness = 40.0\ndamping = 2.0\n[policy]\njoints = ["joint0", "joint1", "joint2"]\n'
+    recipe += 'pose = [0.1, 0.2, 0.3]\naction = { scale = 0.25 }\nobservation = [{ term = "joint_pos" }]\n'
+    (tmp_path / "recipe.toml").write_text(recipe)
+    model = ppo(3, 3)
+    model.policy.action_net.bias = np.array([3.0, -3.0, 0.5]) + 0.0 * model.policy.action_net.bias
+    model.policy.action_net.weight = 0.0 * model.policy.action_net.weight
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        controller = nearl.import_sb3(model, False, robot=tmp_path / "arm.urdf", recipe=tmp_path / "recipe.toml")
+    action, _ = controller.update(np.zeros(3), np.zeros(3), np.zeros(6))
+    np.testing.assert_allclose(action, [0.1 + 0.25, 0.2 - 0.25, 0.3 + 0.125], atol=1e-6)
+
+
+def test_a_wrapper_of_a_vector_that_nobody_knows_is_refused_by_its_name() -> None:
+    class Halved:
+        def __init__(self, venv):
+            self.venv = venv
+
+    class VecMonitor(Halved):
+        pass
+
+    vector = SimpleNamespace(envs=[])
+    model = ppo(17, 6, get_env=lambda: Halved(VecMonitor(vector)), get_vec_normalize_env=lambda: None)
+    with pytest.raises(ValueError, match="behind the wrapper Halved of its vector"):
+        nearl.import_sb3(model, task="HalfCheetah-v5")
+    nearl.import_sb3(ppo(17, 6, get_env=lambda: VecMonitor(vector), get_vec_normalize_env=lambda: None), task="HalfCheetah-v5")

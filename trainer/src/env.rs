@@ -190,6 +190,11 @@ pub trait Env: Send {
     /// The simulation, for those who watch it: the plant process, the limit meter, tests.
     fn sim(&self) -> &Sim;
 
+    /// Velocity (nv) at the end of the last step, before what the task changes by itself for the next, as a push: what its action led to.
+    fn ended(&self) -> &[f64] {
+        self.sim().qvel()
+    }
+
     /// What the task asks for (empty where it has no goal). With `qpos` and `qvel` it makes an episode repeatable.
     fn goal(&self) -> &[f64];
 

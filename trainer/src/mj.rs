@@ -503,6 +503,10 @@ fn set_afloat(urdf: &str) -> Result<String, MjError> {
     let model = nearl_runtime::constraints::Model::from_urdf_text(urdf);
     let root =
         model.map(|m| m.description().bodies[0].name.clone()).map_err(|e| MjError::Load(e.to_string()))?;
+    if root == "world" {
+        let reason = "the root link of the URDF is called 'world', which is MuJoCo's own, and a base that floats hangs on it; call the link otherwise";
+        return Err(MjError::Load(reason.into()));
+    }
     let end = urdf.rfind("</robot>").unwrap_or(urdf.len());
     let joint = format!(
         "<link name=\"world\"/><joint name=\"root_joint\" type=\"floating\"><parent link=\"world\"/><child link=\"{root}\"/></joint>"

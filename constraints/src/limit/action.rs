@@ -15,6 +15,7 @@
 //! and a sum falls where its multiplier grows: bisection ends between two neighbouring floating-point numbers, on the side that obeys.
 
 use super::PerJoint;
+use crate::description::Motor;
 use crate::{LimitError, Model, Recent};
 use serde::{Deserialize, Serialize};
 
@@ -90,13 +91,15 @@ const MOST: f64 = 1e18;
 const TOLERANCE: f64 = 1e-9;
 
 impl ActionLimit {
-    /// For the actions of `model`'s motors, `range` their lowest and highest values (n_act).
+    /// For the actions of `model`'s motors, or, where there are fewer, of those of the joints of `controllable` in the motors' order; `range` are their
+    /// lowest and highest values (n_act).
     ///
     /// # Errors
     /// [`LimitError`] for a number that is none, an entry that drives no joint alone, and limits that may leave no action.
     pub fn new(
         settings: &ActionSettings,
         model: &Model,
+        controllable: &[usize],
         range: Vec<(f64, f64)>,
     ) -> Result<ActionLimit, LimitError> {
         let unusable = |what: String, next: &'static str| Err(LimitError::Unusable { what, next });
@@ -124,7 +127,7 @@ impl ActionLimit {
             let what = "action.rate beside power or delivered may leave nothing when a joint becomes faster";
             return unusable(what.into(), "keep one of them");
         }
-        let dofs = driven(model, range.len())?;
+        let dofs = driven(model, range.len(), controllable)?;
         let rate = match &settings.rate {
             None => vec![f64::INFINITY; range.len()],
             Some(rate) => {
@@ -287,11 +290,22 @@ impl ActionLimit {
     }
 }
 
-/// The dof that each of `n` action entries drives.
-fn driven(model: &Model, n: usize) -> Result<Vec<usize>, LimitError> {
+/// The dof that each of `n` action entries drives: of all motors, or, where fewer are commanded, of those of the joints of `controllable`, in their order.
+fn driven(model: &Model, n: usize, controllable: &[usize]) -> Result<Vec<usize>, LimitError> {
+    let is_commanded = |motor: &&Motor| {
+        let joint = model.find(&motor.joint).ok();
+        joint.is_some_and(|joint| joint.nv == 1 && controllable.contains(&joint.idx_v))
+    };
+    let mut commanded: Vec<&Motor> = model.motors().iter().filter(is_commanded).collect();
+    commanded.sort_by_key(|motor| motor.order);
+    let all = model.motors().len() == n;
     (0..n)
         .map(|i| {
-            let joint = model.motors().iter().find(|m| m.order == i).map(|m| m.joint.as_str());
+            let motor = match all {
+                true => model.motors().iter().find(|m| m.order == i),
+                false => commanded.get(i).copied().filter(|_| commanded.len() == n),
+            };
+            let joint = motor.map(|m| m.joint.as_str());
             let joint = joint.and_then(|name| model.find(name).ok()).filter(|joint| joint.nv == 1);
             joint.map(|joint| joint.idx_v).ok_or_else(|| LimitError::Unusable {
                 what: format!("action entry {i} drives no joint of one dof that the robot file names"),

@@ -11,7 +11,7 @@ fn settings(text: &str) -> ActionSettings {
 }
 
 fn limit(text: &str) -> ActionLimit {
-    ActionLimit::new(&settings(text), &small_arm(), vec![(-1.0, 1.0); N]).unwrap()
+    ActionLimit::new(&settings(text), &small_arm(), &[], vec![(-1.0, 1.0); N]).unwrap()
 }
 
 /// By how much `a` breaks what the text asks for, from its formulas.
@@ -119,10 +119,27 @@ fn a_rate_begins_anew_and_its_memory_travels() {
     assert!(!limit("square = 1.0").remembers() && limit("square = 1.0").memory_len() == 0);
 }
 
+/// Where fewer joints are commanded than have motors, each entry is that of its own joint.
+#[test]
+fn entries_are_those_of_the_joints_that_are_commanded() {
+    let unit = || vec![(-1.0, 1.0)];
+    let mut of_last = ActionLimit::new(&settings("power = 1.0"), &small_arm(), &[N - 1], unit()).unwrap();
+    let (mut v, mut a) = (vec![0.0; N], vec![1.0_f64]);
+    v[N - 1] = 4.0;
+    of_last.project(&v, &mut a, true);
+    assert!((a[0] - 0.25).abs() < 1e-12, "4 rad/s times {} is 1", a[0]);
+    (v, a) = (vec![4.0; N], vec![1.0]);
+    v[N - 1] = 0.0;
+    of_last.project(&v, &mut a, true);
+    assert_eq!(a, [1.0], "of a joint that stands");
+    let other = ActionLimit::new(&settings("power = 1.0"), &small_arm(), &[0, 1], unit()).unwrap_err();
+    assert!(other.to_string().contains("action entry 0 drives no joint"), "{other}");
+}
+
 #[test]
 fn what_cannot_be_kept_is_refused_by_name() {
     let refused = |text: &str, range: (f64, f64), n: usize| {
-        ActionLimit::new(&settings(text), &small_arm(), vec![range; n]).unwrap_err().to_string()
+        ActionLimit::new(&settings(text), &small_arm(), &[], vec![range; n]).unwrap_err().to_string()
     };
     let unit = (-1.0, 1.0);
     for (text, range, n, words) in [

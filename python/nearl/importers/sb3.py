@@ -83,8 +83,10 @@ def import_sb3(
     wrappers = rescaling_wrappers(model) if task is not None and robot is None else []
     for wrapper in wrappers:
         layers, low, high = rescaled(wrapper, layers, low, high)
-    # What leaves the range of the space is cut there by the model, and by the motors; a proposed state has no motor.
-    made = policy_of(layers, mean, std, clip, (low, high) if actions != "actuators" or wrappers else (-math.inf, math.inf))
+    # What leaves the range of the space is cut there by the model, and by the motors of its task; a proposed state has no motor, and what a recipe makes
+    # of an output has another range.
+    is_cut = actions != "actuators" or wrappers or robot is not None
+    made = policy_of(layers, mean, std, clip, (low, high) if is_cut else (-math.inf, math.inf))
     if task is not None and robot is None:
         _check_range(low, high, task_of(task), actions)
     settings = _rate(model, task) if task is not None and robot is None and recipe is None and actions == "actuators" else []

@@ -16,18 +16,34 @@ _UNTOUCHED = frozenset({
 })  # fmt: skip
 
 
-def _envs(model: Any) -> list[Any]:
-    """The single environments that the model learned in, with their wrappers; empty where it brings none."""
-    env = getattr(model, "get_env", lambda: None)()
+# Wrappers of Stable-Baselines3's vectors that change nothing that a policy sees or does, and the one that is taken along.
+_UNTOUCHED_VECTORS = frozenset({"VecCheckNan", "VecMonitor", "VecNormalize", "VecVideoRecorder"})
+
+
+def _vectors(model: Any) -> tuple[list[Any], list[Any]]:
+    """The wrappers around the vector that the model learned in, and its single environments with theirs; empty where it brings none."""
+    env, around = getattr(model, "get_env", lambda: None)(), []
     while env is not None and not hasattr(env, "envs") and hasattr(env, "venv"):
+        around.append(env)
         env = env.venv
-    return list(getattr(env, "envs", None) or [])
+    return around, list(getattr(env, "envs", None) or [])
+
+
+def _envs(model: Any) -> list[Any]:
+    return _vectors(model)[1]
 
 
 def rescaling_wrappers(model: Any) -> list[Any]:
     """The wrappers that rescale the actions of the first environment, outermost first. Those that change observations otherwise than VecNormalize, or
     actions otherwise, are refused in each: the controller gives the observation of the task, and takes what the network puts out."""
-    each = [_rescaling(one) for one in _envs(model)]
+    around, envs = _vectors(model)
+    for kind in (type(wrapper).__name__ for wrapper in around):
+        if kind not in _UNTOUCHED_VECTORS:
+            raise ValueError(
+                f"the model learned behind the wrapper {kind} of its vector, of which only its environment knows what it does to observations and actions; "
+                f"learn without it, or give robot= and a recipe= that says how the policy sees each entry"
+            )
+    each = [_rescaling(one) for one in envs]
     return each[0] if each else []
 
 

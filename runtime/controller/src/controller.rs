@@ -210,7 +210,7 @@ impl Controller {
         let bounds = m.bounds_drives();
         let drive_box = bounds.then(|| DriveBox::new(m, &model, layout.controllable(), &projector));
         let drive_box = drive_box.transpose()?;
-        let action_limit = Parts::action_limit(m, &model)?;
+        let action_limit = Parts::action_limit(m, &model, layout.controllable())?;
         let idx_q = idx_q(&model);
         let dial = Dial::new(m, &model, layout.controllable(), &idx_q, projector.limits())?;
         let zero = |n| vec![0.0; n];

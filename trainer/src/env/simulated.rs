@@ -16,6 +16,8 @@ pub(super) struct Simulated<R> {
     ahead: Option<Sim>,
     foreseen: Vec<f64>,
     start: (Vec<f64>, Vec<f64>),
+    /// Velocity that the last step ended with; empty where nothing changed it since.
+    ended: Vec<f64>,
     counters: Counters,
     last_error: Option<MjError>,
 }
@@ -23,7 +25,7 @@ pub(super) struct Simulated<R> {
 impl<R: Rules> Simulated<R> {
     /// Boxes a task whose robot was compiled into `sim`.
     pub(super) fn boxed(spec: Spec, robot: Robot, rules: R, sim: Sim) -> Box<dyn Env> {
-        let start = (vec![0.0; spec.nq], vec![0.0; spec.nv]);
+        let (start, nv) = ((vec![0.0; spec.nq], vec![0.0; spec.nv]), spec.nv);
         Box::new(Simulated {
             spec,
             robot,
@@ -32,6 +34,7 @@ impl<R: Rules> Simulated<R> {
             ahead: None,
             foreseen: Vec::new(),
             start,
+            ended: Vec::with_capacity(nv),
             counters: Counters::default(),
             last_error: None,
         })
@@ -160,6 +163,10 @@ impl<R: Rules> Env for Simulated<R> {
         }
         self.rules.follow(&self.sim, action);
         let (reward, terminated) = self.rules.score(&self.spec, &self.sim, before, action);
+        self.ended.clear();
+        if self.rules.pushes() {
+            self.ended.extend_from_slice(self.sim.qvel());
+        }
         self.rules.advance(&mut self.sim);
         Step { reward, cost: 0.0, terminated, fault: Fault::None }
     }
@@ -198,6 +205,7 @@ impl<R: Rules> Env for Simulated<R> {
 
     fn score(&mut self, from: &Moment<'_>, to: &Moment<'_>, action: &[f64]) -> Result<Step, EnvError> {
         self.place(from)?;
+        self.ended.clear();
         self.rules.begin(&self.sim);
         let before = self.rules.progress(&self.sim);
         self.place(to)?;
@@ -225,6 +233,10 @@ impl<R: Rules> Env for Simulated<R> {
 
     fn sim(&self) -> &Sim {
         &self.sim
+    }
+
+    fn ended(&self) -> &[f64] {
+        if self.ended.is_empty() { self.sim.qvel() } else { &self.ended }
     }
 
     fn goal(&self) -> &[f64] {

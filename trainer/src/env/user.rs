@@ -462,7 +462,7 @@ impl Rules for User {
 
     fn score(&mut self, spec: &Spec, sim: &Sim, _: f64, action: &[f64]) -> (f64, bool) {
         let (before, course) = (&self.before, Some(&self.course));
-        let outcome = Outcome { sim, before, action, dt: spec.dt, course };
+        let outcome = Outcome { sim, v: sim.qvel(), before, action, dt: spec.dt, course };
         let mut reward = 0.0;
         for (i, term) in self.reward.iter().enumerate() {
             let value = term.weight * term.of.value(|q| outcome.read(q));

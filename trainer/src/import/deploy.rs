@@ -24,6 +24,9 @@ struct Deploy {
     observations: Ordered<Term>,
 }
 
+/// Outputs of a policy do not go so far: a clip from there on cuts none.
+const FAR: f64 = 20.0;
+
 #[derive(Deserialize)]
 struct Action {
     clip: Option<Vec<[f64; 2]>>,
@@ -34,6 +37,8 @@ struct Action {
 
 #[derive(Deserialize)]
 struct Term {
+    #[serde(default)]
+    params: serde_json::Value,
     clip: Option<[f64; 2]>,
     scale: Option<Numbers>,
     history_length: Option<i64>,
@@ -114,11 +119,12 @@ pub(super) fn recipe(text: &str, joints: &[String]) -> Result<Table, String> {
         ("stiffness", by_joint(&said.stiffness)),
         ("damping", by_joint(&said.damping)),
     ];
+    let remembers = said.observations.0.iter().any(|(name, _)| name.contains("action"));
     let policy = [
-        ("action", action(said.actions)?),
-        ("observation", terms(said.observations)?),
+        ("action", action(said.actions, &said.default_joint_pos, remembers)?),
+        ("observation", terms(said.observations, &named)?),
         ("pose", said.default_joint_pos.into()),
-        ("joints", named.into()),
+        ("joints", named.clone().into()),
     ];
     Ok(table([
         ("time", table([("dt", said.step_dt.into())]).into()),
@@ -142,7 +148,8 @@ fn motors(joints: &[String]) -> Vec<String> {
     }
 }
 
-fn action(actions: Ordered<Action>) -> Result<Value, String> {
+/// Their clip is of targets, after scale and offset, and a recipe's of outputs, before them: `(clip - offset) / scale`.
+fn action(actions: Ordered<Action>, pose: &[f64], remembers: bool) -> Result<Value, String> {
     let mut actions = actions.0;
     let names = || "its actions are none but JointPositionAction, which is what is read".to_string();
     let (name, action) = actions.pop().ok_or_else(names)?;
@@ -152,18 +159,52 @@ fn action(actions: Ordered<Action>) -> Result<Value, String> {
     if action.joint_ids.is_some() {
         return Err("JointPositionAction.joint_ids: an action of some joints alone is not read".into());
     }
+    let of = |numbers: &Option<Numbers>, i: usize, otherwise: f64| match numbers {
+        None => Some(otherwise),
+        Some(Numbers::One(x)) => Some(*x),
+        Some(Numbers::Each(all)) => all.get(i).copied(),
+    };
+    let outputs = |(i, ends): (usize, &[f64; 2])| {
+        let (scale, offset) = (of(&action.scale, i, 1.0)?, of(&action.offset, i, *pose.get(i)?)?);
+        let [low, high] = ends.map(|end| (end - offset) / scale);
+        (scale != 0.0).then_some([low.min(high), low.max(high)])
+    };
+    let clip =
+        action.clip.as_ref().map(|clip| clip.iter().enumerate().map(outputs).collect::<Option<Vec<_>>>());
+    let wrong = || "JointPositionAction.clip does not fit its scale and offset".to_string();
+    let clip = clip.map(|clip| clip.ok_or_else(wrong)).transpose()?;
+    if remembers && clip.iter().flatten().flatten().any(|end| end.abs() < FAR) {
+        return Err(
+            "JointPositionAction.clip cuts targets that the policy sees uncut as its last action, and a recipe's clip cuts both; leave it out, and bound \
+             the targets by limits on positions"
+                .into(),
+        );
+    }
     let mut said = Table::new();
     let numbers = [("scale", action.scale), ("offset", action.offset)];
     said.extend(numbers.into_iter().filter_map(|(key, value)| Some((key.to_string(), value?.into()))));
-    if let Some(clip) = action.clip {
+    if let Some(clip) = clip {
         let side = |side: usize| Value::from(clip.iter().map(|ends| ends[side]).collect::<Vec<_>>());
         said.insert("clip".into(), vec![side(0), side(1)].into());
     }
     Ok(said.into())
 }
 
+/// The joints of a term, which its `params.asset_cfg.joint_ids` numbers in the policy's order.
+fn joints_of(term: &Term, name: &str, named: &[String]) -> Result<Option<Vec<Value>>, String> {
+    let Some(ids) = term.params.pointer("/asset_cfg/joint_ids").and_then(|ids| ids.as_array()) else {
+        return Ok(None);
+    };
+    let joint =
+        |id: &serde_json::Value| Some(Value::from(named.get(usize::try_from(id.as_u64()?).ok()?)?.clone()));
+    let joints = ids.iter().map(joint).collect::<Option<Vec<_>>>();
+    joints.map(Some).ok_or_else(|| {
+        format!("observations: joint_ids of '{name}' names a joint that the policy does not have")
+    })
+}
+
 /// The terms in their order; their names are those of recipes, or refused there.
-fn terms(observations: Ordered<Term>) -> Result<Value, String> {
+fn terms(observations: Ordered<Term>, named: &[String]) -> Result<Value, String> {
     let mut terms = Vec::new();
     for (name, said) in observations.0 {
         if name == "gait_phase" {
@@ -172,6 +213,9 @@ fn terms(observations: Ordered<Term>) -> Result<Value, String> {
         let mut term = table([("history", said.history_length.unwrap_or(1).max(1).into())]);
         if name == "velocity_commands" {
             term.insert("entries".into(), COMMAND.map(Value::from).to_vec().into());
+        }
+        if let Some(joints) = joints_of(&said, &name, named)? {
+            term.insert("joints".into(), joints.into());
         }
         term.insert("term".into(), name.into());
         if let Some(scale) = said.scale {

@@ -53,6 +53,10 @@ impl Model {
 
     /// The share of their weight that is held of all bodies that move (`gravcomp`): as if gravity were weaker. `None` where it is not the same.
     fn held_weight(&self) -> Option<f64> {
+        // MuJoCo computes no passive force where springs and dampers are both switched off, and this is one.
+        if self.disables(mjtDisableBit::mjDSBL_SPRING) && self.disables(mjtDisableBit::mjDSBL_DAMPER) {
+            return Some(0.0);
+        }
         let m = &self.0;
         let moves = |id: &usize| m.body_weldid()[*id] != 0 && m.body_mass()[*id] > 0.0;
         let mut shares = (1..self.n_bodies()).filter(moves).map(|id| m.body_gravcomp()[id]);

@@ -262,6 +262,14 @@ pub(super) fn check_experience(
             "[state.privileged]: {source} knows no more of a robot than its policy sees; take it out, or train without {next}"
         )));
     }
+    if matches!(experience, Experience::Loop(..))
+        && let Some((key, name)) = followed(task)
+    {
+        return Err(TrainError::Settings(format!(
+            "[{key}] reads '{name}', which is followed through the physics steps of a period, and {source} tells where each period begins and ends; take it \
+             out, or train without {next}"
+        )));
+    }
     if task.constraints.reached.is_some() && matches!(experience, Experience::Loop(..)) {
         return Err(TrainError::Settings(format!(
             "[constraints.reached]: {source} learns margins of its own, without which its ticks cannot be computed again; take it out, or train \
@@ -274,6 +282,21 @@ pub(super) fn check_experience(
         )));
     }
     Ok(())
+}
+
+/// The first name in a reward, cost or end of the task that is followed from physics step to physics step, with its key.
+fn followed(task: &Task) -> Option<(String, String)> {
+    const NAMES: [&str; 3] = ["power", "du.squared", "dtorque.max"];
+    const BEGIN: [&str; 6] = ["torque.", "load.", "contact.", "air.", "landed.", "cfrc."];
+    let is_followed = |name: &&str| NAMES.contains(name) || BEGIN.iter().any(|begin| name.starts_with(begin));
+    let sections = [("reward", &task.reward), ("cost", &task.cost), ("termination", &task.termination)];
+    sections.into_iter().find_map(|(section, terms)| {
+        terms.iter().find_map(|(key, text)| {
+            let words = text.as_str()?.split(|c: char| !(c.is_alphanumeric() || "._".contains(c)));
+            let name = words.map(|word| word.trim_matches('.')).find(is_followed)?;
+            Some((format!("{section}.{key}"), name.to_owned()))
+        })
+    })
 }
 
 pub(super) fn check_minibatch(minibatch: usize, batch: usize) -> Result<(), TrainError> {

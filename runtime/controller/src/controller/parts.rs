@@ -97,7 +97,11 @@ impl Parts {
     ///
     /// # Errors
     /// [`SnapshotError::Unusable`] where another stage has the last word on the action, and as [`Parts::new`].
-    pub fn action_limit(m: &Manifest, model: &Model) -> Result<Option<ActionLimit>, SnapshotError> {
+    pub fn action_limit(
+        m: &Manifest,
+        model: &Model,
+        controllable: &[usize],
+    ) -> Result<Option<ActionLimit>, SnapshotError> {
         let Some(settings) = &m.task.constraints.action else { return Ok(None) };
         let analytic = m.policy != PolicyKind::Direct && m.task.idm.kind == IdmKind::Pinocchio;
         let other = match m.task.constraints.guard {
@@ -113,7 +117,7 @@ impl Parts {
             )));
         }
         let range = m.action_lower.iter().copied().zip(m.action_upper.iter().copied()).collect();
-        ActionLimit::new(settings, model, range).map(Some).map_err(|e| unusable(&e))
+        ActionLimit::new(settings, model, controllable, range).map(Some).map_err(|e| unusable(&e))
     }
 
     fn projector_of(

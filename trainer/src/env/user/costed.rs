@@ -24,8 +24,8 @@ impl Costed {
 
 impl Costed {
     fn with_cost(&self, step: Step, action: &[f64]) -> Step {
-        let outcome =
-            Outcome { sim: self.inner.sim(), before: &self.before, action, dt: self.spec.dt, course: None };
+        let (sim, v) = (self.inner.sim(), self.inner.ended());
+        let outcome = Outcome { sim, v, before: &self.before, action, dt: self.spec.dt, course: None };
         let cost = self.cost.iter().map(|t| t.weight * t.of.value(|q| outcome.read(q))).sum();
         Step { cost, ..step }
     }
@@ -97,6 +97,10 @@ impl Env for Costed {
 
     fn sim(&self) -> &Sim {
         self.inner.sim()
+    }
+
+    fn ended(&self) -> &[f64] {
+        self.inner.ended()
     }
 
     fn goal(&self) -> &[f64] {

@@ -299,6 +299,8 @@ impl Before {
 /// Reads quantities after a control period.
 pub(super) struct Outcome<'a> {
     pub(super) sim: &'a Sim,
+    /// Velocity (nv) that the period ended with.
+    pub(super) v: &'a [f64],
     pub(super) before: &'a Before,
     pub(super) action: &'a [f64],
     pub(super) dt: f64,
@@ -321,14 +323,12 @@ impl Outcome<'_> {
             Quantity::TorqueSquared => self.over_drives(|dof| sim.applied_force_of(dof).powi(2)).sum(),
             Quantity::TorqueMax => self.course.map_or(0.0, |course| course.forces.largest),
             Quantity::TorqueRateMax => self.course.map_or(0.0, |course| course.forces.fastest / self.dt),
-            Quantity::Power => {
-                self.over_drives(|dof| (sim.applied_force_of(dof) * sim.qvel()[dof]).abs()).sum()
-            }
+            Quantity::Power => self.over_drives(|dof| (sim.applied_force_of(dof) * self.v[dof]).abs()).sum(),
             Quantity::Acceleration => self.over_drives(|dof| self.acceleration(dof).powi(2)).sum(),
             Quantity::AccelerationMax => {
                 self.over_drives(|dof| self.acceleration(dof).abs()).fold(0.0, f64::max)
             }
-            state => Seen { sim, q: sim.qpos(), v: sim.qvel(), dt: self.dt, course: self.course }.read(state),
+            state => Seen { sim, q: sim.qpos(), v: self.v, dt: self.dt, course: self.course }.read(state),
         }
     }
 
@@ -338,7 +338,7 @@ impl Outcome<'_> {
 
     /// Mean acceleration of a degree of freedom over the control period.
     fn acceleration(&self, dof: usize) -> f64 {
-        (self.sim.qvel()[dof] - self.before.v[dof]) / self.dt
+        (self.v[dof] - self.before.v[dof]) / self.dt
     }
 }
 
