@@ -220,7 +220,6 @@ def test_a_deployment_of_unitree_is_a_recipe(tmp_path) -> None:
 def test_clips_and_joints_of_a_deployment_are_those_of_unitree(tmp_path) -> None:
     """Their clip is of targets, ``clip(scale x output + offset)``, and ``joint_ids`` number the policy's joints."""
     files = planar(tmp_path)
-    names = ["joint0", "joint1", "joint2"]
     deploy = """joint_ids_map: [2, 0, 1]
 step_dt: 0.01
 stiffness: [40.0, 41.0, 42.0]
@@ -234,7 +233,8 @@ observations:
     (tmp_path / "deploy.yaml").write_text(deploy)
     weight = f32(3.0 * np.eye(2, 3))
     path = Net(2).add("Gemm", weight).save(tmp_path / "policy.onnx", 3)
-    controller = nearl.import_onnx(path, robot=files["robot"], recipe=tmp_path / "deploy.yaml")
+    (tmp_path / "free.toml").write_text("[constraints]\nguard = false\n")
+    controller = nearl.import_onnx(path, robot=files["robot"], recipe=[tmp_path / "deploy.yaml", tmp_path / "free.toml"])
     order, scale, offset = [2, 0, 1], np.array([0.5, -0.6, 0.7]), np.array([0.3, 0.1, 0.2])
     for q in RNG.uniform(-0.4, 0.4, size=(20, 3)):
         controller.reset()
@@ -242,9 +242,8 @@ observations:
         target = np.clip(scale * (seen @ weight) + offset, [0.2, 0.0, -1.0], [0.6, 0.15, 0.25])
         want = np.zeros(3)
         want[order] = target
-        action, _ = controller.update(q, np.zeros(3), np.concatenate([q, np.zeros(3)]))
+        action, _ = controller.update(np.concatenate([np.zeros(6), [1.0], q]), np.zeros(9), np.zeros(len(controller.obs_names)))
         np.testing.assert_allclose(action, want, atol=1e-5)
-    assert [f"q.{name}" for name in names] == controller.obs_names[:3]
     with_last = deploy + "  last_action: {params: {}, clip: null, scale: 1.0, history_length: 1}\n"
     (tmp_path / "deploy.yaml").write_text(with_last)
     with pytest.raises(ValueError, match="cuts targets that the policy sees uncut as its last action"):

@@ -186,7 +186,7 @@ def test_a_model_that_learned_behind_a_wrapper_of_observations_is_not_taken_for_
 
     def learned(wrap):
         envs = SimpleNamespace(envs=[wrap(gymnasium.make("HalfCheetah-v5"))], has_attr=lambda _: False)
-        return ppo(17, 6, get_env=lambda: SimpleNamespace(venv=envs, has_attr=lambda _: False), get_vec_normalize_env=lambda: None)
+        return ppo(17, 6, get_env=lambda: type("VecMonitor", (SimpleNamespace,), {})(venv=envs, has_attr=lambda _: False), get_vec_normalize_env=lambda: None)
 
     for wrap in (
         wrappers.NormalizeObservation,
