@@ -298,7 +298,7 @@ fn driven(model: &Model, n: usize, controllable: &[usize]) -> Result<Vec<usize>,
     };
     let mut commanded: Vec<&Motor> = model.motors().iter().filter(is_commanded).collect();
     commanded.sort_by_key(|motor| motor.order);
-    let all = model.motors().len() == n;
+    let all = n >= model.motors().len();
     (0..n)
         .map(|i| {
             let motor = match all {
