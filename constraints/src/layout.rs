@@ -27,16 +27,15 @@ pub enum Entry {
     Other,
 }
 
-/// Names of the parts of a joint of `nq` configuration entries and `nv` degrees of freedom, as in `q.root.qw` and `v.root.wx`: empty for a joint of
-/// one, and none for a joint that MuJoCo does not have.
+/// Names of the parts of a joint of `nq` configuration entries and `nv` degrees of freedom, as in `q.root.qw` and `v.root.wx`: an empty name for one
+/// that has no parts.
 pub fn parts_of(nq: usize, nv: usize) -> (&'static [&'static str], &'static [&'static str]) {
     const POSITION: [&str; 7] = [".x", ".y", ".z", ".qw", ".qx", ".qy", ".qz"];
     const VELOCITY: [&str; 6] = [".x", ".y", ".z", ".wx", ".wy", ".wz"];
     match (nq, nv) {
-        (1, 1) => (&[""], &[""]),
         (7, 6) => (&POSITION, &VELOCITY),
         (4, 3) => (&POSITION[3..], &VELOCITY[3..]),
-        _ => (&[], &[]),
+        _ => (&[""], &[""]),
     }
 }
 
@@ -289,4 +288,32 @@ fn entry(model: &Model, name: &str) -> Result<Entry, LayoutError> {
         return Ok(Entry::Velocity { dof: one_dof("observation", model, name, joint)?.idx_v });
     }
     Ok(Entry::Other)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A joint that turns on and on has no angle to be observed: it is never read from an observation without a word.
+    #[test]
+    fn what_an_observation_cannot_hold_is_unseen() {
+        let link = |name: &str| {
+            format!(
+                "<link name=\"{name}\"><inertial><mass value=\"1\"/><inertia ixx=\"1\" ixy=\"0\" ixz=\"0\" iyy=\"1\" iyz=\"0\" izz=\"1\"/></inertial></link>"
+            )
+        };
+        let joint = |name: &str, kind: &str, parent: &str, child: &str| {
+            format!(
+                "<joint name=\"{name}\" type=\"{kind}\"><parent link=\"{parent}\"/><child link=\"{child}\"/><axis xyz=\"0 0 1\"/>\
+                 <limit lower=\"-1\" upper=\"1\" effort=\"1\" velocity=\"1\"/></joint>"
+            )
+        };
+        let (turns, bends) = (joint("turns", "continuous", "a", "b"), joint("bends", "revolute", "b", "c"));
+        let urdf = format!("<robot name=\"r\">{}{}{}{turns}{bends}</robot>", link("a"), link("b"), link("c"));
+        let model = Model::from_urdf_text(&urdf).expect("robot");
+        let names = ["q.bends", "v.bends"].map(str::to_owned);
+        let layout = StateLayout::new(&model, &names, None, None).expect("layout");
+        let unseen: Vec<_> = model.joints().iter().map(|joint| layout.first_unseen(joint)).collect();
+        assert_eq!(unseen, [Some("q.turns".to_owned()), None]);
+    }
 }
