@@ -321,9 +321,9 @@ fn tighter(known: &RobotMessage, robot: &RobotMessage) -> Option<String> {
             )
         })
     };
-    robot
-        .states_limits()
-        .then(|| (0..names.len()).find_map(|i| kinds.iter().find_map(|kind| of_joint(kind, i))))?
+    robot.states_limits().then(|| {
+        (0..names.len().min(MAX_JOINTS)).find_map(|i| kinds.iter().find_map(|kind| of_joint(kind, i)))
+    })?
 }
 
 /// True if the state is of the size and from the plant that were announced.
@@ -445,5 +445,38 @@ impl Health {
             [p.p50, p.p99, p.p999, p.max]
         };
         HealthMessage { wake: four(&self.wake), compute: four(&self.compute), ..self.last }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::link::ROBOT_LIMITS;
+
+    #[test]
+    fn a_plant_that_states_tighter_limits_than_it_did_is_another() {
+        let mut known = RobotMessage::zeroed();
+        known.set_joint_names(&["shoulder", "elbow"]);
+        (known.nv, known.bits) = (2, ROBOT_LIMITS);
+        for most in [&mut known.velocity, &mut known.acceleration, &mut known.effort, &mut known.q_upper] {
+            most.fill(2.0);
+        }
+        known.q_lower.fill(-2.0);
+        let mut robot = known;
+        assert_eq!(another(&known, &robot), None);
+        robot.velocity[1] = 3.0;
+        assert_eq!(another(&known, &robot), None, "looser");
+        robot.velocity[1] = 0.5;
+        let said = another(&known, &robot).unwrap();
+        assert!(said.starts_with("it states velocity 0.5 for joint 'elbow' where it stated 2"), "{said}");
+        (robot.velocity[1], robot.q_lower[0]) = (2.0, -1.0);
+        assert!(another(&known, &robot).unwrap().contains("lowest position -1 for joint 'shoulder'"));
+        let mut silent = known;
+        silent.bits = 0;
+        assert_eq!(another(&known, &silent), None, "one that states none");
+        assert!(another(&silent, &known).is_some());
+        let mut many = known;
+        many.set_joint_names(&vec!["j"; 1000]);
+        assert_eq!(tighter(&known, &many), None, "more names than joints");
     }
 }
