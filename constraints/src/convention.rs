@@ -102,10 +102,22 @@ fn quaternion(joint: &Joint) -> Option<usize> {
     }
 }
 
-/// Rotation matrix (rows) of the unit quaternion x y z w of a free joint.
+/// A vector of the world in the axes of a body whose unit quaternion is x y z w: `R' v`.
+///
+/// # Panics
+/// When the quaternion has fewer than four entries.
+pub fn to_body(quaternion: &[f64], v: [f64; 3]) -> [f64; 3] {
+    transposed_times(&rotation_of(quaternion), v)
+}
+
+/// Rotation matrix (rows) of a free joint.
 fn rotation(q: &[f64], joint: &Joint) -> [[f64; 3]; 3] {
-    let at = joint.idx_q + 3;
-    let [x, y, z, w] = [q[at], q[at + 1], q[at + 2], q[at + 3]];
+    rotation_of(&q[joint.idx_q + 3..])
+}
+
+/// Rotation matrix (rows) of the unit quaternion x y z w.
+fn rotation_of(quaternion: &[f64]) -> [[f64; 3]; 3] {
+    let [x, y, z, w] = [quaternion[0], quaternion[1], quaternion[2], quaternion[3]];
     [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
         [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],

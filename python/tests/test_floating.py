@@ -122,3 +122,29 @@ def test_a_goal_beside_a_state_stays_and_a_cost_is_of_what_the_action_did(tmp_pa
     for _ in range(5):
         _, reward, _, _, info = env.step(np.array([0.3]))
         assert info["cost"] == reward, (info, reward)
+
+
+def test_the_gravity_that_an_imported_policy_sees_is_that_of_the_robot_file(tmp_path) -> None:
+    """A network that puts it out, on a base that is turned: the file's direction in the base's axes, by MuJoCo."""
+    onnx = pytest.importorskip("onnx")
+    weight = onnx.numpy_helper.from_array(np.eye(3, 2, dtype=np.float32), "w")
+    value = lambda name, n: onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, n])  # noqa: E731
+    node = onnx.helper.make_node("MatMul", ["obs", "w"], ["actions"])
+    body = onnx.helper.make_graph([node], "policy", [value("obs", 3)], [value("actions", 2)], [weight])
+    onnx.save(onnx.helper.make_model(body, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8), tmp_path / "p.onnx")
+    (tmp_path / "recipe.toml").write_text(
+        '[time]\ndt = 0.004\nsim_dt = 0.004\n[policy]\njoints = ["hip", "tail"]\nobservation = [{ term = "projected_gravity" }]\n'
+    )
+    for gravity in ("4.9 0 -8.5", "0 0 -9.81"):
+        env = nearl.Env(task(tmp_path, gravity))
+        controller = nearl.import_onnx(tmp_path / "p.onnx", robot=tmp_path / "floats.xml", recipe=tmp_path / "recipe.toml")
+        falls = np.array([float(x) for x in gravity.split()])
+        data, rng = mujoco.MjData(mujoco.MjModel.from_xml_path(str(tmp_path / "floats.xml"))), np.random.default_rng(3)
+        for _ in range(5):
+            tumbling(env, rng)
+            data.qpos[:] = env.qpos
+            mujoco.mj_forward(data.model, data)
+            controller.reset()
+            action, _ = controller.update(*env.state, np.zeros(len(controller.obs_names)))
+            seen = data.body("trunk").xmat.reshape(3, 3).T @ (falls / np.linalg.norm(falls))
+            np.testing.assert_allclose(action, seen[:2], atol=1e-6)

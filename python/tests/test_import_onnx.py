@@ -307,3 +307,14 @@ def test_a_graph_of_any_nodes_is_refused_or_right(tmp_path) -> None:
         nodes.append(("Identity", [values[-1]], ["actions"], {}))
         taken += is_refused_or_right(graph(tmp_path, nodes, constants, 4, width), 4)
     assert taken > 40, f"{taken} of 400 are taken"
+
+
+def test_constants_that_grow_node_by_node_are_refused_before_they_fill_the_memory(tmp_path) -> None:
+    """Sums of a column and a row of 2000: a file of some kilobytes that asks for gigabytes."""
+    column, row = f32(np.zeros((2000, 1))), f32(np.zeros((1, 2000)))
+    nodes = [("Add", ["column", "row"], [f"s{k}"], {}) for k in range(100)]
+    nodes += [("MatMul", ["obs", "W"], ["x"], {}), ("Slice", ["s99", "from", "to"], ["cut"], {}), ("Add", ["x", "cut"], ["actions"], {})]
+    constants = {"W": W, "column": column, "row": row, "from": np.array([0, 0]), "to": np.array([1, 2])}
+    path = graph(tmp_path, nodes, constants, 4, 2)
+    with pytest.raises(ValueError, match="makes more constants than any policy has"):
+        nearl.Policy.from_onnx(path)

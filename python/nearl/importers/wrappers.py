@@ -29,10 +29,6 @@ def _vectors(model: Any) -> tuple[list[Any], list[Any]]:
     return around, list(getattr(env, "envs", None) or [])
 
 
-def _envs(model: Any) -> list[Any]:
-    return _vectors(model)[1]
-
-
 def rescaling_wrappers(model: Any) -> list[Any]:
     """The wrappers that rescale the actions of the first environment, outermost first. Those that change observations otherwise than VecNormalize, or
     actions otherwise, are refused in each: the controller gives the observation of the task, and takes what the network puts out."""
@@ -85,6 +81,6 @@ def rescaled(wrapper: Any, layers: list[Layer], low: np.ndarray, high: np.ndarra
 
 def native_env(model: Any) -> Any:
     """The environment of ours that the model learned in; None where it is another, or it brings none."""
-    envs = _envs(model)
+    _, envs = _vectors(model)
     env = envs[0].unwrapped if envs else getattr(model, "get_env", lambda: None)()
     return getattr(env, "native", None)

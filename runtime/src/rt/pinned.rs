@@ -108,12 +108,10 @@ impl Pinned {
         if found.is_empty() {
             return Ok(());
         }
-        let (shown, more) = (found.len().min(3), found.len().saturating_sub(3));
-        let more = if more > 0 { format!("; and {more} more") } else { String::new() };
         let text = format!(
-            "looser than the limits of the loop ({}): {}{more}; train within them, or start the loop with --allow-looser",
+            "looser than the limits of the loop ({}): {}; train within them, or start the loop with --allow-looser",
             self.source,
-            found[..shown].join("; ")
+            first_few(&found)
         );
         Err(Refusal { verdict: Verdict::Looser, text })
     }
@@ -296,6 +294,13 @@ impl Pinned {
         }
         None
     }
+}
+
+/// The first three clauses, and how many more there are.
+pub(crate) fn first_few(found: &[String]) -> String {
+    let (shown, more) = (found.len().min(3), found.len().saturating_sub(3));
+    let more = if more > 0 { format!("; and {more} more") } else { String::new() };
+    format!("{}{more}", found[..shown].join("; "))
 }
 
 /// `is > was`, beyond rounding.

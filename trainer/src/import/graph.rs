@@ -4,7 +4,7 @@ use super::ImportError;
 use super::chain::{Live, Operation};
 use super::fold::{cast_to, fold};
 use super::network::ImportedNetwork;
-use super::tensor::Tensor;
+use super::tensor::{MOST, Tensor};
 use nearl_runtime::net::Function;
 use rten_onnx::onnx::{AttributeProto, DataType, GraphProto, NodeProto};
 use std::collections::HashMap;
@@ -28,6 +28,8 @@ pub(super) struct Graph<'a> {
     values: HashMap<&'a str, Value>,
     lives: Vec<Live>,
     outputs: Vec<&'a str>,
+    /// Elements that nodes of constants have made so far.
+    folded: usize,
     beside: Option<&'a Path>,
 }
 
@@ -35,7 +37,7 @@ impl<'a> Graph<'a> {
     /// Reads constants and inputs, then every node in order.
     pub(super) fn new(graph: &'a GraphProto, beside: Option<&'a Path>) -> Self {
         let outputs = graph.output.iter().filter_map(|o| o.name.as_deref()).collect();
-        let mut this = Self { values: HashMap::new(), lives: Vec::new(), outputs, beside };
+        let mut this = Self { values: HashMap::new(), lives: Vec::new(), outputs, folded: 0, beside };
         for constant in &graph.initializer {
             let name = constant.name.as_deref().unwrap_or_default();
             let value = Tensor::read(constant, beside).map_or_else(
@@ -147,8 +149,14 @@ impl<'a> Graph<'a> {
             return Ok(vec![Value::Constant(Tensor::of_attribute(attribute, self.beside)?)]);
         }
         match constants(inputs) {
-            Some(all) => fold(&Node { node, op, at: 0, constant: &|i| all.get(i).copied().flatten() })
-                .map(|t| vec![Value::Constant(t)]),
+            Some(all) => {
+                let made = fold(&Node { node, op, at: 0, constant: &|i| all.get(i).copied().flatten() })?;
+                self.folded += made.values.len();
+                if self.folded > MOST {
+                    return Err("makes more constants than any policy has".into());
+                }
+                Ok(vec![Value::Constant(made)])
+            }
             None => self.operation(node, op, name, inputs),
         }
     }

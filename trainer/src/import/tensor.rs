@@ -11,7 +11,7 @@ pub(super) struct Tensor {
 }
 
 /// More elements than any policy's layer has.
-const MOST: usize = 1 << 26;
+pub(super) const MOST: usize = 1 << 26;
 
 impl Tensor {
     pub(super) fn scalar(value: f64) -> Self {

@@ -2,6 +2,7 @@
 
 use super::{PolicySection, Term, TermKind};
 use crate::controller::State;
+use nearl_constraints::convention::to_body;
 use nearl_constraints::{Joint, Model, StateLayout};
 
 /// A term's values before clip and scale.
@@ -86,7 +87,7 @@ impl Source {
                 to.iter_mut().zip(list).for_each(|(x, &(iq, from))| *x = state.q[iq] - from)
             }
             Self::Velocity(list) => to.iter_mut().zip(list).for_each(|(x, &dof)| *x = state.v[dof]),
-            Self::Gravity(iq, down) => to.copy_from_slice(&to_base(&state.q[iq + 3..iq + 7], *down)),
+            Self::Gravity(iq, down) => to.copy_from_slice(&to_body(&state.q[iq + 3..iq + 7], *down)),
             Self::Linear(dof, [x, y, z]) => {
                 let (v, w) = (&state.v[*dof..dof + 3], &state.v[dof + 3..dof + 6]);
                 let turned = [w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x];
@@ -127,17 +128,6 @@ fn unread(term: &Term) -> Option<&'static str> {
         ("point", term.point.is_some()),
     ];
     has.into_iter().find(|(key, there)| *there && !reads.contains(key)).map(|(key, _)| key)
-}
-
-/// `R^T d` of the unit quaternion `(u, w)`: `d + 2 (u x (u x d) - w (u x d))`.
-fn to_base(quaternion: &[f64], d: [f64; 3]) -> [f64; 3] {
-    let (u, w) = ([quaternion[0], quaternion[1], quaternion[2]], quaternion[3]);
-    let cross = |a: [f64; 3], b: [f64; 3]| {
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    };
-    let ud = cross(u, d);
-    let uud = cross(u, ud);
-    [0, 1, 2].map(|i| d[i] + 2.0 * (uud[i] - w * ud[i]))
 }
 
 /// A joint with one degree of freedom and one position.

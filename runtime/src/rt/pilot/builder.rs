@@ -4,7 +4,7 @@ use super::Pilot;
 use crate::controller::Controller;
 use crate::link::{MAX_JOINTS, MAX_OBS, Robot, RobotMessage, SnapshotBytes, Verdict, hash_names};
 use crate::rt::meaning::Meaning;
-use crate::rt::pinned::{Pinned, UNITS, above};
+use crate::rt::pinned::{Pinned, UNITS, above, first_few};
 use crate::rt::run::check_holding;
 use crate::rt::tick::{Build, Refusal};
 use crate::snapshot::{Manifest, Snapshot, SnapshotError};
@@ -184,11 +184,9 @@ pub(super) fn compare_limits(controller: &Controller, plant: &RobotMessage) -> R
     if found.is_empty() {
         return Ok(());
     }
-    let (shown, more) = (found.len().min(3), found.len().saturating_sub(3));
-    let more = if more > 0 { format!("; and {more} more") } else { String::new() };
     let text = format!(
-        "the snapshot allows more than the plant: {}{more}; train within the plant's limits, or start the plant with the snapshot's task",
-        found[..shown].join("; ")
+        "the snapshot allows more than the plant: {}; train within the plant's limits, or start the plant with the snapshot's task",
+        first_few(&found)
     );
     Err(Refusal { verdict: Verdict::Looser, text })
 }
